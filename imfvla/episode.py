@@ -1,0 +1,84 @@
+"""What an episode is made of, for simulator, recorder, evaluator and report alike. Needs numpy only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+CONTROL_HZ = 50
+STATE_DIM = 16
+ACTION_DIM = 16
+ACTION_NAMES = tuple(
+    f"{arm}/{name}" for arm in ("left", "right") for name in (*(f"joint_{i}" for i in range(1, 8)), "gripper")
+)
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeInfo:
+    """What is known when an episode begins."""
+
+    task: str  # "socket" | "transfer"
+    kind: str  # "demonstration" | "rollout"
+    seed: int  # handed to reset; draws the start state
+    start_digest: str  # hex digest of the start state
+    instruction: str
+    views: tuple[str, ...]
+    image_size: tuple[int, int]  # (H, W) [px]
+    config: Mapping[str, Any]  # attached to the recording whole
+    metadata: Mapping[str, Any] = field(default_factory=dict)  # expert style, policy name, nfe, ...
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What an actor answers at one control step."""
+
+    action: np.ndarray  # float32 (A,)  what a policy should learn here, physical units
+    executed: np.ndarray  # float32 (A,)  what is applied: `action`, plus exploration noise in demonstrations
+    images: Mapping[str, np.ndarray] | None = None  # view -> uint8 (H, W, 3), where the actor looked
+    chunk: np.ndarray | None = None  # float32 (Tp, A), where it replanned
+    inference_ms: float | None = None  # from numpy observation to numpy chunk, where it replanned
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One control step: state and images hold before the action is applied, reward and stage after it."""
+
+    index: int
+    time_s: float  # simulated, before the action
+    state: np.ndarray  # float32 (S,)
+    decision: Decision
+    reward: float
+    stage: int
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """One row of `episodes.jsonl`. Times are the only fields that differ between equal runs."""
+
+    seed: int
+    start_digest: str
+    num_steps: int
+    total_reward: float
+    max_reward: float
+    success: bool
+    first_step_of_stage: tuple[int, ...]  # entry k - 1: first step at which stage k held, -1 for never
+    failure: str | None  # label of an abnormal end ("non-finite action", ...), None for a normal one
+    inference_ms: tuple[float, ...]  # one per replanning
+    wall_s: float
+
+
+class Actor(Protocol):
+    """Chooses actions. A demonstrator may read the simulator behind `env`; a policy only looks through its cameras."""
+
+    def reset(self, env: Any, seed: int) -> None: ...
+    def act(self, env: Any, state: np.ndarray, step: int) -> Decision: ...
+
+
+class Sink(Protocol):
+    """Receives an episode as it happens: `begin`, `step` for each control step, then `end` or, after an exception, `abort`."""
+
+    def begin(self, env: Any, info: EpisodeInfo) -> None: ...
+    def step(self, env: Any, step: Step) -> None: ...
+    def end(self, result: EpisodeResult) -> None: ...
+    def abort(self) -> None: ...

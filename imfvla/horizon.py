@@ -1,0 +1,49 @@
+"""Horizon: the only place with index arithmetic between observations, predicted chunks and executed actions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imfvla.errors import UserError
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """How many control steps a policy observes, predicts and executes.
+
+    At the decision step `s` the policy sees the observations of steps `s - obs + 1 ... s` (the first one repeated
+    where the episode has not begun yet), predicts the actions of steps `s ... s + pred - 1` and executes those of
+    `s ... s + exec - 1`. Action `s` is applied right after observation `s`.
+    """
+
+    obs: int
+    pred: int
+    exec: int
+
+    def __post_init__(self) -> None:
+        for name in ("obs", "pred", "exec"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise UserError(f"horizon.{name} must be a whole number of at least 1, found {value!r}.")
+        if self.exec > self.pred:
+            raise UserError(
+                f"horizon.exec must not exceed horizon.pred: only predicted actions can be executed, "
+                f"found exec={self.exec} and pred={self.pred}; lower horizon.exec or raise horizon.pred."
+            )
+
+    def observed_steps(self, step: int) -> np.ndarray:
+        """Steps seen at the decision `step`, oldest first: int64 (obs,), clamped at the episode's start."""
+        return np.maximum(np.arange(step - self.obs + 1, step + 1), 0)
+
+    def action_steps(self, step: int, episode_length: int) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of the chunk decided at `step`: int64 (pred,), the last one repeated past the end, and bool (pred,) valid."""
+        steps = np.arange(step, step + self.pred)
+        return np.minimum(steps, episode_length - 1), steps < episode_length
+
+    def is_decision(self, step: int) -> bool:
+        """Whether the policy replans at `step` of an episode."""
+        return step % self.exec == 0
+
+    def is_observed(self, step: int) -> bool:
+        """Whether the observation of `step` enters a decision: the steps whose cameras must be looked at."""
+        return (-step) % self.exec < self.obs

@@ -1,0 +1,33 @@
+"""Tensors that travel between data, policy and loop.
+
+Shapes: B batch, To observed steps, V views, H W pixels, S state, L instruction words, Tp predicted steps, A action.
+"""
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a policy sees at one decision."""
+
+    images: Tensor  # uint8   (B, To, V, 3, H, W)
+    state: Tensor  # float32 (B, To, S)  per arm 7 joint angles [rad] and the gripper opening [0, 1]
+    instruction: Tensor  # int64   (B, L)  word ids, 0 is padding
+
+    def to(self, device: torch.device | str) -> "Observation":
+        return Observation(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Observations with the actions that followed them."""
+
+    obs: Observation
+    actions: Tensor  # float32 (B, Tp, A)  physical units; actions[:, 0] is applied right after the last observation
+    valid: Tensor  # bool    (B, Tp)  False past the episode's end
+
+    def to(self, device: torch.device | str) -> "Batch":
+        return Batch(self.obs.to(device), self.actions.to(device), self.valid.to(device))
