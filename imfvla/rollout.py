@@ -1,0 +1,120 @@
+"""One episode: an actor in an environment, watched by sinks. Demonstrations and policy rollouts run through here alike."""
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from imfvla.episode import CONTROL_HZ, Actor, EpisodeInfo, EpisodeResult, Sink, Step
+
+NON_FINITE = "non-finite action"
+FAR_OUT_OF_RANGE = "action far out of range"
+SIMULATION_ENDED = "simulation ended early"
+
+
+class ActionError(Exception):
+    """Raised by an actor that has no action to give; `run_episode` ends the episode as failed with this label."""
+
+
+def run_episode(
+    env: Any,
+    actor: Actor,
+    seed: int,
+    sinks: Sequence[Sink],
+    *,
+    kind: str,
+    config: Mapping[str, Any],
+    metadata: Mapping[str, Any] | None = None,
+    max_steps: int | None = None,
+) -> EpisodeResult:
+    """Runs the episode that starts from `seed` and returns its row.
+
+    The episode lasts until the environment ends it, until `max_steps` control steps, or until `actor.done(env)` where
+    the actor has a `done` (demonstrators stop some steps after success; policies run to the end).
+
+    An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row keeps the
+    reward collected so far, carries the label and counts as no success. Any other exception aborts the sinks and is
+    raised again.
+
+    Args:
+      env: a `BimanualEnvironment` (see `imfvla.tasks`).
+      actor: an `episode.Actor`; its `style`, where it has one, goes into the recording's metadata.
+      seed: draws the start state, and whatever the actor draws.
+      sinks: recorders, begun in order after the reset and ended in order after the last step.
+      kind: "demonstration" or "rollout".
+      config: attached to the recording whole.
+      metadata: policy name, nfe and the like.
+      max_steps: an upper bound on the control steps, for short tests.
+
+    Returns:
+      The episode's row; `first_step_of_stage[k - 1]` is the first step after which stage k or a higher one held.
+    """
+    timestep = env.reset(seed=seed)
+    start_digest = env.start_digest()
+    actor.reset(env, seed)
+    done = getattr(actor, "done", None)
+    limit = env.time_limit_steps if max_steps is None else min(max_steps, env.time_limit_steps)
+    info = EpisodeInfo(
+        task=env.name,
+        kind=kind,
+        seed=seed,
+        start_digest=start_digest,
+        instruction=env.instruction,
+        views=tuple(env.views),
+        image_size=tuple(env.image_size),
+        config=config,
+        metadata={**(metadata or {}), **({"style": dict(actor.style)} if hasattr(actor, "style") else {})},
+    )
+    rewards: list[float] = []
+    inference_ms: list[float] = []
+    first_step_of_stage = [-1] * env.num_stages
+    failure = None
+    with ExitStack() as aborts:
+        for sink in sinks:
+            aborts.callback(sink.abort)
+            sink.begin(env, info)
+        began = time.perf_counter()
+        for index in range(limit):
+            state = env.state()
+            try:
+                decision = actor.act(env, state, index)
+                if not np.isfinite(decision.executed).all():
+                    raise ActionError(NON_FINITE)
+            except ActionError as error:
+                failure = str(error)
+                break
+            timestep = env.step(decision.executed)
+            stage = env.stage()
+            rewards.append(float(timestep.reward))
+            if decision.inference_ms is not None:
+                inference_ms.append(float(decision.inference_ms))
+            for reached in range(stage):
+                if first_step_of_stage[reached] < 0:
+                    first_step_of_stage[reached] = index
+            step = Step(index, index / CONTROL_HZ, state, decision, rewards[-1], stage)
+            for sink in sinks:
+                sink.step(env, step)
+            if timestep.last():
+                failure = SIMULATION_ENDED if index + 1 < env.time_limit_steps else None
+                break
+            if done is not None and done(env):
+                break
+        max_reward = max(rewards, default=0.0)
+        result = EpisodeResult(
+            seed=seed,
+            start_digest=start_digest,
+            num_steps=len(rewards),
+            total_reward=float(sum(rewards)),
+            max_reward=max_reward,
+            success=failure is None and max_reward >= env.success_stage,
+            first_step_of_stage=tuple(first_step_of_stage),
+            failure=failure,
+            inference_ms=tuple(inference_ms),
+            wall_s=time.perf_counter() - began,
+        )
+        for sink in sinks:
+            sink.end(result)
+        aborts.pop_all()
+    return result
