@@ -1,0 +1,68 @@
+# Every target works on a fresh clone: what it needs is installed first, once. `make help` lists them.
+
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+
+# Overridable: make train EXP=transfer_ph32_exec16 ARGS="seed=1"
+PYTHON ?= python3
+EXP ?= socket_ph32_exec16
+TASK ?= socket
+EPISODES ?= 4
+ARGS ?=
+
+VENV := .venv
+PY := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+
+.PHONY: help setup train demos eval bench tables gallery test lint clean
+
+help:  ## List the targets
+	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
+	     /^[a-z]+:.*## / {printf "  %-9s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+	@printf '\n  ARGS="..." is handed to the command, PYTHON=python3.12 chooses the interpreter of $(VENV).\n'
+
+setup: $(INSTALLED)  ## Install into .venv, install a GL library if none renders, check the machine
+	@$(PY) tools/doctor.py --only gl > /dev/null || tools/install_gl.sh
+	@$(PY) tools/doctor.py
+
+train: setup  ## Main job: demonstrations, training, 100 rollouts, the table's row (EXP=socket_ph32_exec16)
+	$(PY) -m imfvla.train +exp=$(EXP) $(ARGS)
+
+demos: setup  ## Record the demonstrations of both tasks (ARGS="episodes=200")
+	$(PY) -m imfvla.collect task=socket $(ARGS)
+	$(PY) -m imfvla.collect task=transfer $(ARGS)
+
+eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or transfer, EPISODES=4)
+	$(PY) -m imfvla.evaluate run=experiments/pretrained/$(TASK)_ph32_exec16 episodes=$(EPISODES) $(ARGS)
+
+bench: setup  ## Measure simulation, rendering, training and latency on this machine
+	$(PY) -m imfvla.bench $(ARGS)
+
+tables: setup  ## Make the paper's tables from the run directories
+	$(PY) -m imfvla.report $(ARGS)
+
+gallery: setup  ## Write pictures of every view of both tasks
+	$(PY) -m imfvla.gallery $(ARGS)
+
+test: setup  ## Run the tests on two processes (ARGS="tests/tasks -k seed")
+	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 $(ARGS)
+
+lint: $(INSTALLED)  ## Check style and format with ruff
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+clean:  ## Remove .venv and caches; runs/ and data/ stay
+	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "imfvla needs Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); name one: make setup PYTHON=python3.11" >&2; \
+	  exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { \
+	  echo "$(PYTHON) could not make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
+	  exit 1; }
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@

@@ -1,0 +1,267 @@
+#!/usr/bin/env python3
+"""Look at this machine: can it simulate, render, train and record? Each failing line comes with its remedy.
+
+    python tools/doctor.py                # everything; exit code 1 if a line fails
+    python tools/doctor.py --only gl      # one check
+
+The frame is rendered in a process of its own with a time limit, so a graphics driver that hangs cannot hang the doctor.
+"""
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+MIN_PYTHON = (3, 11)
+MIN_FREE_GB = 5.0  # demonstrations, frame store and one run of a task
+MIN_MEMORY_GB = 4.0
+RENDER_TIMEOUT_S = 30.0
+GL_BACKENDS = ("egl", "osmesa")
+GL_REMEDY = (
+    "make setup installs a GL library where it may; by hand: sudo apt-get install -y --no-install-recommends "
+    "libegl1 libegl-mesa0 libgl1-mesa-dri"
+)
+CPU_FLAGS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")  # the ones that decide the speed of fp32 and bf16
+
+# A floor, a ball and a light: enough for a frame that is neither blank nor the same everywhere.
+SCENE = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 2"/>
+    <camera name="front" pos="0 -1.2 0.8" xyaxes="1 0 0 0 0.55 0.83"/>
+    <geom type="plane" size="1 1 .1" rgba=".2 .6 .3 1"/>
+    <geom type="sphere" size=".2" pos="0 0 .2" rgba=".8 .2 .2 1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's report; `remedy` is None where all is well."""
+
+    name: str
+    text: str
+    remedy: str | None = None
+
+
+def check_python() -> Finding:
+    """The interpreter is new enough, and is the project's own environment or one the user chose."""
+    found = f"{platform.python_implementation()} {platform.python_version()} at {sys.prefix}"
+    if sys.version_info < MIN_PYTHON:
+        return Finding(
+            "python", found, "Python 3.11 or newer is needed: make clean, then make setup PYTHON=python3.11"
+        )
+    return Finding("python", found)
+
+
+def check_machine() -> Finding:
+    """CPU model, the flags that matter for speed, cores and memory."""
+    model, flags = _cpu()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    text = f"{model}, {cores} cores ({' '.join(flags) or 'no fast vector flags'}), {memory_gb:.1f} GB memory"
+    if memory_gb < MIN_MEMORY_GB:
+        return Finding(
+            "machine", text, f"{MIN_MEMORY_GB:.0f} GB of memory are needed to train; use a larger machine"
+        )
+    return Finding("machine", text)
+
+
+def check_threads() -> Finding:
+    """How many threads torch would use; more than there are cores makes small matrices up to 40 times slower."""
+    try:
+        import torch
+    except ImportError as error:
+        return Finding("threads", f"torch does not import: {error}", "make setup")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    setting = os.environ.get("OMP_NUM_THREADS", "unset")
+    text = f"torch uses {torch.get_num_threads()} threads on {cores} cores (OMP_NUM_THREADS {setting})"
+    if torch.cuda.is_available():
+        text += f", GPU {torch.cuda.get_device_name()}"
+    if torch.get_num_threads() > cores:
+        return Finding("threads", text, f"export OMP_NUM_THREADS={cores}")
+    return Finding("threads", text)
+
+
+def check_packages(constraints: Path = ROOT / "constraints.txt") -> Finding:
+    """The installed packages are those of constraints.txt (a local version such as torch's +cpu does not matter)."""
+    missing, other, num_pins = [], [], 0
+    for line in constraints.read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        name, _, wanted = line.partition("==")
+        num_pins += 1
+        try:
+            found = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            missing.append(name)
+            continue
+        if found.partition("+")[0] != wanted:
+            other.append(f"{name} {found} (wanted {wanted})")
+    if missing or other:
+        problems = [f"{name} is missing" for name in missing] + other
+        shown = ", ".join(problems[:4]) + (f" and {len(problems) - 4} more" if len(problems) > 4 else "")
+        return Finding("packages", shown, "touch constraints.txt && make setup")
+    names = ("torch", "mujoco", "dm-control", "numpy")
+    versions = ", ".join(f"{name} {metadata.version(name)}" for name in names)
+    return Finding("packages", f"all {num_pins} as pinned: {versions}")
+
+
+def check_gl(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
+    """A frame can be rendered: the backend that imfvla chooses, its renderer and the frame's digest."""
+    frame, problem = _render_in_child({}, timeout_s)
+    if frame is not None:
+        text = "{backend}, {renderer}, frame {digest} in {seconds:.1f} s".format(**frame)
+        if not frame["has_content"]:
+            return Finding(
+                "gl", f"{text} is blank", f"try the other backend: export MUJOCO_GL=osmesa; or {GL_REMEDY}"
+            )
+        return Finding("gl", text)
+    chosen = os.environ.get("MUJOCO_GL")
+    for backend in GL_BACKENDS:
+        if backend == chosen:
+            continue
+        frame, _ = _render_in_child({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}, timeout_s)
+        if frame is not None and frame["has_content"]:
+            return Finding("gl", f"{problem}; {backend} renders", f"export MUJOCO_GL={backend}")
+    return Finding("gl", problem, GL_REMEDY)
+
+
+def check_video() -> Finding:
+    """PNG (episodes) and H.264 (videos) can be written."""
+    try:
+        import av
+        import cv2
+        import numpy as np
+
+        image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+        encoded, png = cv2.imencode(".png", image)
+        lossless = encoded and bool((cv2.imdecode(png, cv2.IMREAD_COLOR) == image).all())
+        codec = av.Codec("libx264", "w").long_name
+    except Exception as error:
+        return Finding("video", f"{type(error).__name__}: {error}", "touch constraints.txt && make setup")
+    if not lossless:
+        return Finding("video", "PNG is not read back as written", "touch constraints.txt && make setup")
+    return Finding("video", f"PNG lossless, {codec}")
+
+
+def check_disk(root: Path = ROOT) -> Finding:
+    """The checkout can be written to and there is room for demonstrations and runs."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=root, prefix=".doctor-", suffix=".tmp"):
+            pass
+    except OSError as error:
+        remedy = f"make it writable (chown -R $USER {root}), or clone to a folder of your own"
+        return Finding("disk", f"{root} cannot be written: {error.strerror}", remedy)
+    free_gb = shutil.disk_usage(root).free / 1e9
+    text = f"{root} is writable, {free_gb:.1f} GB free"
+    if free_gb < MIN_FREE_GB:
+        return Finding(
+            "disk",
+            text,
+            f"free {MIN_FREE_GB:.0f} GB: old run directories under runs/ and data/ are safe to remove",
+        )
+    return Finding("disk", text)
+
+
+CHECKS: dict[str, Callable[[], Finding]] = {
+    "python": check_python,
+    "machine": check_machine,
+    "threads": check_threads,
+    "packages": check_packages,
+    "gl": check_gl,
+    "video": check_video,
+    "disk": check_disk,
+}
+
+
+def render_frame() -> dict:
+    """Render one frame as the simulator would: backend, renderer, digest, seconds, whether it shows anything."""
+    import hashlib
+    import time
+
+    sys.path.insert(0, str(ROOT))
+    from imfvla.gl import select_gl_backend
+
+    start = time.perf_counter()
+    backend = select_gl_backend()
+    from dm_control import mujoco
+    from OpenGL import GL
+
+    pixels = mujoco.Physics.from_xml_string(SCENE).render(64, 64, camera_id="front")
+    renderer = GL.glGetString(GL.GL_RENDERER)
+    return {
+        "backend": backend,
+        "renderer": renderer.decode() if renderer else "unknown renderer",
+        "digest": hashlib.sha256(pixels.tobytes()).hexdigest()[:12],
+        "seconds": time.perf_counter() - start,
+        "has_content": bool(pixels.std() > 1.0),
+    }
+
+
+def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dict | None, str]:
+    """The answer of `render_frame` in a process of its own, or None and what went wrong."""
+    command = [sys.executable, str(Path(__file__).resolve()), "--render-frame"]
+    try:
+        child = subprocess.run(
+            command,
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return None, f"no frame within {timeout_s:.0f} s: the graphics driver hangs"
+    if child.returncode == 0:
+        return json.loads(child.stdout.splitlines()[-1]), ""
+    last = (child.stderr.strip().splitlines() or [f"the renderer died with code {child.returncode}"])[-1]
+    return None, f"no frame could be rendered: {last}"
+
+
+def _cpu() -> tuple[str, list[str]]:
+    """Model name and the flags of `CPU_FLAGS` that this CPU has."""
+    model, flags = platform.processor() or platform.machine(), []
+    cpuinfo = Path("/proc/cpuinfo")
+    for line in cpuinfo.read_text().splitlines() if cpuinfo.exists() else ():
+        key, _, value = line.partition(":")
+        if key.strip() == "model name":
+            model = value.strip()
+        elif key.strip() == "flags":
+            flags = [flag for flag in CPU_FLAGS if flag in value.split()]
+            break
+    return model, flags
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--only", choices=CHECKS, action="append", help="run this check alone (may be repeated)"
+    )
+    parser.add_argument("--render-frame", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.render_frame:
+        print(json.dumps(render_frame()))
+        return 0
+    num_failed = 0
+    for name in options.only or CHECKS:
+        finding = CHECKS[name]()
+        print(f"{'ok  ' if finding.remedy is None else 'FAIL'}  {finding.name:<9} {finding.text}", flush=True)
+        if finding.remedy is not None:
+            num_failed += 1
+            print(f"      {'':<9} remedy: {finding.remedy}", flush=True)
+    return 1 if num_failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
