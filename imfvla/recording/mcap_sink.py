@@ -1,0 +1,172 @@
+"""McapSink: writes one episode, demonstration or rollout, as one MCAP file."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from imfvla.episode import EpisodeInfo, EpisodeResult, Step
+from imfvla.errors import UserError
+from imfvla.recording import messages, schemas
+from imfvla.recording.pictures import encode
+from imfvla.recording.scene import at_time, body_names, frame_transforms, scene_update
+
+TRANSFORMS_EVERY = 5  # steps between two /tf messages: 10 Hz
+INFO, WARNING = 2, 3  # levels of foxglove.Log
+
+
+class McapSink:
+    """An `episode.Sink` that writes `path` with the topics of `imfvla.recording.messages`.
+
+    Frames are those that the actor looked at (`Decision.images`); with `render_every`, steps divisible by
+    it that come without frames get those of `env.look()`. They are PNG if `lossless`, as training wants
+    them, else JPEG. `begin` expects `env` after its reset and `step` after the action, so what the
+    simulator shows then, frames and body poses, belongs to the step that comes next and is kept until it
+    does.
+
+    The file is written beside `path` under a hidden name and renamed by `end`; `abort`, and any error while
+    writing, removes it and leaves what was at `path` before. Raises UserError naming `path` where it cannot
+    be written.
+    """
+
+    def __init__(self, path: str | Path, *, lossless: bool = True, render_every: int | None = None) -> None:
+        if render_every is not None and render_every < 1:
+            raise ValueError(f"render_every must be at least 1 or None, found {render_every}.")
+        self.path = Path(path)
+        self._part = self.path.with_name(f".{self.path.name}.part")
+        self._lossless = lossless
+        self._render_every = render_every
+        self._stream = None
+
+    def begin(self, env: Any, info: EpisodeInfo) -> None:
+        with self._cleaning_up():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = open(self._part, "wb")  # noqa: SIM115  closed by end or abort
+            self._writer = Writer(
+                self._stream, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+            )
+            self._writer.start(profile="", library="imfvla")
+            self._channels: dict[str, int] = {}
+            self._schemas: dict[str, int] = {}
+            self._num_steps = self._stage = 0
+            self._writer.add_metadata(messages.EPISODE_RECORD, messages.info_record(info))
+            self._writer.add_attachment(
+                messages.EPOCH_NS,
+                messages.EPOCH_NS,
+                messages.CONFIG_ATTACHMENT,
+                "application/json",
+                messages.dump(info.config),
+            )
+            self._bodies = body_names(env.physics.model)
+            self._scene = scene_update(env.physics.model)
+            self._see(env, 0)
+
+    def step(self, env: Any, step: Step) -> None:
+        with self._cleaning_up():
+            self._time = messages.time_ns(step.time_s)
+            if self._num_steps == 0:
+                self._write(messages.SCENE, schemas.SCENE_UPDATE, at_time(self._scene, self._time))
+            if self._transforms is not None:
+                self._write(
+                    messages.TRANSFORMS, schemas.FRAME_TRANSFORMS, at_time(self._transforms, self._time)
+                )
+            images = step.decision.images
+            self._write_images(self._frames if images is None else images)
+            self._write(messages.STATE, schemas.ROBOT_STATE, messages.by_arm(step.state))
+            self._write_decision(step)
+            reward = {"reward": float(step.reward), "stage": int(step.stage)}
+            self._write(messages.REWARD, schemas.REWARD, reward)
+            if step.stage != self._stage:
+                self._log(INFO, f"step {step.index}: stage {self._stage} -> {step.stage}")
+                self._stage = step.stage
+            self._num_steps += 1
+            self._see(env, step.index + 1)
+
+    def end(self, result: EpisodeResult) -> None:
+        with self._cleaning_up():
+            if self._num_steps:
+                outcome = result.failure or ("success" if result.success else "no success")
+                level = WARNING if result.failure else INFO
+                self._log(level, f"end after {result.num_steps} steps: {outcome}")
+            self._writer.add_metadata(messages.RESULT_RECORD, messages.result_record(result, self._num_steps))
+            self._writer.finish()
+            self._stream.close()
+            self._part.replace(self.path)
+            self._stream = None
+
+    def abort(self) -> None:
+        """Removes what was written so far. Does nothing before `begin` and after `end`."""
+        if self._stream is not None:
+            with suppress(OSError):  # closing flushes, and a full disk must not keep the file
+                self._stream.close()
+            self._stream = None
+            self._part.unlink(missing_ok=True)
+
+    def _see(self, env: Any, next_step: int) -> None:
+        """Keeps what the simulator shows now for the next step, where that step is to be recorded."""
+        moved, physics = next_step % TRANSFORMS_EVERY == 0, env.physics
+        self._transforms = frame_transforms(self._bodies, physics.data) if moved else None
+        self._frames = env.look() if self._render_every and next_step % self._render_every == 0 else {}
+
+    def _write_images(self, images: Mapping[str, np.ndarray]) -> None:
+        for view, frame in images.items():
+            encoded, image_format = encode(np.ascontiguousarray(frame), lossless=self._lossless)
+            message = messages.camera_message(self._time, view, encoded, image_format)
+            self._write(messages.CAMERA + view, schemas.COMPRESSED_IMAGE, message)
+
+    def _write_decision(self, step: Step) -> None:
+        decision = step.decision
+        action = {
+            "clean": messages.by_arm(decision.action),
+            "executed": messages.by_arm(decision.executed),
+        }
+        self._write(messages.ACTION, schemas.ROBOT_ACTION, action)
+        if decision.chunk is not None:
+            chunk = {
+                "step": step.index,
+                "names": messages.ACTION_NAMES,
+                "actions": messages.numbers(decision.chunk),
+            }
+            self._write(messages.CHUNK, schemas.ACTION_CHUNK, chunk)
+        if decision.inference_ms is not None:
+            self._write(messages.INFERENCE, schemas.INFERENCE, {"ms": float(decision.inference_ms)})
+
+    def _log(self, level: int, text: str) -> None:
+        log = {"timestamp": messages.stamp(self._time), "level": level, "message": text, "name": "episode"}
+        self._write(messages.LOG, schemas.LOG, log | {"file": "", "line": 0})
+
+    def _write(self, topic: str, schema: schemas.Schema, message: Any) -> None:
+        if topic not in self._channels:
+            name = schema["title"]
+            if name not in self._schemas:
+                data = messages.dump(schema)
+                self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
+            self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name])
+        data = message if isinstance(message, bytes) else messages.dump(message)
+        self._writer.add_message(self._channels[topic], self._time, data, self._time)
+
+    def _cleaning_up(self) -> "_CleaningUp":
+        return _CleaningUp(self)
+
+
+class _CleaningUp:
+    """Aborts the sink when its block fails, and names the file where the file system is the reason."""
+
+    def __init__(self, sink: McapSink) -> None:
+        self._sink = sink
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type | None, error: BaseException | None, traceback: object) -> None:
+        if error is None:
+            return
+        self._sink.abort()
+        if isinstance(error, OSError):
+            raise UserError(
+                f"Cannot record {self._sink.path}: {error.strerror or error}. "
+                "Free disk space or choose another directory, and run the command again."
+            ) from error

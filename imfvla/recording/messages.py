@@ -1,0 +1,115 @@
+"""How an episode's parts are written as JSON messages, and read back.
+
+Every message of control step s carries the simulated time of step s, counted from a fixed epoch, so that
+equal episodes make equal files. Numbers survive exactly: a float32 is written as the float64 that equals
+it, a non-finite one as null.
+"""
+
+import base64
+import json
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult
+
+FORMAT = "1"
+EPOCH_NS = 1_767_225_600 * 10**9  # 2026-01-01T00:00:00Z
+EPISODE_RECORD = "imfvla.episode"  # metadata: EpisodeInfo, written first
+RESULT_RECORD = "imfvla.result"  # metadata: EpisodeResult, written last: a file without it is incomplete
+CONFIG_ATTACHMENT = "config.json"
+
+CAMERA = "/camera/"
+STATE = "/robot/state"
+ACTION = "/robot/action"
+CHUNK = "/policy/chunk"
+INFERENCE = "/policy/inference_ms"
+REWARD = "/episode/reward"
+LOG = "/episode/log"
+TRANSFORMS = "/tf"
+SCENE = "/scene"
+
+_ARM_AND_JOINT = tuple(tuple(name.split("/")) for name in ACTION_NAMES)
+
+
+def time_ns(time_s: float) -> int:
+    """Log time of a simulated time [s]."""
+    return EPOCH_NS + round(time_s * 1e9)
+
+
+def stamp(log_time_ns: int) -> dict[str, int]:
+    """Foxglove's `time` of a log time."""
+    return {"sec": log_time_ns // 10**9, "nsec": log_time_ns % 10**9}
+
+
+def dump(value: Any) -> bytes:
+    """Compact JSON; numpy scalars and arrays are allowed."""
+    return json.dumps(value, separators=(",", ":"), default=_plain).encode()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be recorded as JSON: {value!r}")
+
+
+def numbers(values: np.ndarray) -> list:
+    """Nested lists of an array's numbers, None where one is not finite."""
+    values = np.asarray(values)
+    return (values if np.isfinite(values).all() else np.where(np.isfinite(values), values, None)).tolist()
+
+
+def by_arm(values: np.ndarray) -> dict[str, dict[str, float | None]]:
+    """(16,) in the order of ACTION_NAMES, as {"left": {"joint_1": ...}, "right": ...}."""
+    arms: dict[str, dict[str, float | None]] = {}
+    for (arm, joint), value in zip(_ARM_AND_JOINT, numbers(values), strict=True):
+        arms.setdefault(arm, {})[joint] = value
+    return arms
+
+
+def from_arms(arms: dict[str, dict[str, float | None]]) -> list[float | None]:
+    """Inverse of `by_arm`."""
+    return [arms[arm][joint] for arm, joint in _ARM_AND_JOINT]
+
+
+def camera_message(log_time_ns: int, view: str, encoded: bytes, image_format: str) -> bytes:
+    """foxglove.CompressedImage."""
+    data = base64.b64encode(encoded).decode("ascii")
+    return dump({"timestamp": stamp(log_time_ns), "frame_id": view, "format": image_format, "data": data})
+
+
+def camera_bytes(message: bytes) -> bytes:
+    """The encoded picture inside a foxglove.CompressedImage."""
+    return base64.b64decode(json.loads(message)["data"], validate=True)
+
+
+def info_record(info: EpisodeInfo) -> dict[str, str]:
+    """Metadata record of an episode's beginning: JSON texts by field; the config travels as attachment."""
+    names = (field.name for field in fields(info) if field.name != "config")
+    return {"format": FORMAT} | {name: dump(getattr(info, name)).decode() for name in names}
+
+
+def read_info(record: dict[str, str], config: dict[str, Any]) -> EpisodeInfo:
+    """Inverse of `info_record`."""
+    values = {name: json.loads(text) for name, text in record.items() if name != "format"}
+    values |= {"views": tuple(values["views"]), "image_size": tuple(values["image_size"])}
+    return EpisodeInfo(config=config, **values)
+
+
+def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:
+    """Metadata record of an episode's end, with the number of steps that were recorded."""
+    names = (field.name for field in fields(result))
+    return {"recorded_steps": str(num_recorded)} | {
+        name: dump(getattr(result, name)).decode() for name in names
+    }
+
+
+def read_result(record: dict[str, str]) -> EpisodeResult:
+    """Inverse of `result_record`."""
+    values = {name: json.loads(text) for name, text in record.items() if name != "recorded_steps"}
+    for name in ("first_step_of_stage", "inference_ms"):
+        values[name] = tuple(values[name])
+    return EpisodeResult(**values)
