@@ -1,0 +1,48 @@
+"""From feature maps to a few tokens per view: learned spatial attention that says what is seen and where.
+
+Shapes: B batch, V views, C channels, h w feature map, P = h w positions, M attention maps, K tokens per view, D width.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+class ViewTokens(nn.Module):
+    """Each of `maps` attention maps of a view yields its mean position and the mean of a few features under it.
+
+    A generalised spatial softmax (arXiv 1504.00702): positions make the tokens precise to a fraction of a feature,
+    features tell what lies there. Every view has weights of its own. (B, V, C, h, w) -> (B, V * tokens, width).
+    """
+
+    def __init__(
+        self, *, views: int, channels: int, tokens: int, maps: int, features: int, width: int
+    ) -> None:
+        super().__init__()
+        if maps % tokens:
+            raise ValueError(f"{maps} attention maps cannot be shared evenly by {tokens} tokens per view")
+        self.tokens = tokens
+        self.maps = nn.Parameter(torch.randn(views, maps, channels) / math.sqrt(channels))
+        self.features = nn.Parameter(torch.randn(views, features, channels) / math.sqrt(channels))
+        inputs = (maps // tokens) * (features + 2)
+        self.output = nn.Parameter(torch.randn(views, tokens, inputs, width) / math.sqrt(inputs))
+        self.identity = nn.Parameter(0.02 * torch.randn(views, tokens, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        height, width = x.shape[-2:]
+        x = x.flatten(3)
+        attention = (self.maps @ x).softmax(-1)  # (B, V, M, P)
+        grid = positions(height, width, x)
+        seen = torch.cat(((self.features @ x), grid.expand(*x.shape[:2], 2, -1)), dim=2)  # (B, V, F + 2, P)
+        pooled = attention @ seen.transpose(-1, -2)  # (B, V, M, F + 2)
+        pooled = pooled.unflatten(2, (self.tokens, -1)).flatten(3)
+        tokens = torch.einsum("bvki,vkid->bvkd", pooled, self.output) + self.identity
+        return tokens.flatten(1, 2)
+
+
+def positions(height: int, width: int, like: Tensor) -> Tensor:
+    """Row and column of each feature in [-1, 1], a constant: (2, height * width)."""
+    rows = torch.linspace(-1, 1, height, dtype=like.dtype, device=like.device)
+    columns = torch.linspace(-1, 1, width, dtype=like.dtype, device=like.device)
+    return torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)

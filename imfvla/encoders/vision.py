@@ -1,0 +1,73 @@
+"""Vision trunks: a batch of pictures to a feature map. No batch statistics, so that EMA weights are valid weights.
+
+Shapes: N pictures (batch x steps x views), C channels, h w feature map.
+"""
+
+from torch import Tensor, nn
+
+
+def norm(channels: int) -> nn.GroupNorm:
+    return nn.GroupNorm(channels // 16, channels)
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions with group norm and a shortcut (arXiv 1512.03385, the basic block)."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
+            norm(outputs),
+            nn.SiLU(),
+            nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False),
+            norm(outputs),
+        )
+        same = stride == 1 and inputs == outputs
+        self.shortcut = (
+            nn.Identity()
+            if same
+            else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), norm(outputs))
+        )
+        self.activation = nn.SiLU()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.activation(self.body(x) + self.shortcut(x))
+
+
+class CompactCNN(nn.Sequential):
+    """A small trunk for CPUs, 8 pixels a feature: (N, 3, H, W) -> (N, channels, H / 8, W / 8).
+
+    Most of its work is done where convolutions are cheap: the stem strides over 4 pixels at once.
+    """
+
+    def __init__(self, stem_channels: int, channels: int, num_blocks: int) -> None:
+        super().__init__(
+            nn.Conv2d(3, stem_channels, 7, 4, 3, bias=False),
+            norm(stem_channels),
+            nn.SiLU(),
+            nn.Conv2d(stem_channels, channels, 3, 2, 1, bias=False),
+            norm(channels),
+            nn.SiLU(),
+            *(ResidualBlock(channels, channels) for _ in range(num_blocks)),
+        )
+        self.channels = channels
+
+
+class ResNet18(nn.Sequential):
+    """ResNet18 with group norm in place of batch norm, 32 pixels a feature: (N, 3, H, W) -> (N, 512, H / 32, W / 32)."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            nn.Conv2d(3, 64, 7, 2, 3, bias=False),
+            norm(64),
+            nn.SiLU(),
+            nn.MaxPool2d(3, 2, 1),
+            *(ResidualBlock(64, 64) for _ in range(2)),
+            ResidualBlock(64, 128, 2),
+            ResidualBlock(128, 128),
+            ResidualBlock(128, 256, 2),
+            ResidualBlock(256, 256),
+            ResidualBlock(256, 512, 2),
+            ResidualBlock(512, 512),
+        )
+        self.channels = 512

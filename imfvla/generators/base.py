@@ -1,0 +1,64 @@
+"""What every action generator offers to the policy, and the time samplers that they share.
+
+Convention everywhere: t = 0 is data, t = 1 is noise, z_t = (1 - t) x + t e, velocity e - x.
+Shapes: B batch, H steps, A action.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+
+class Generator(Protocol):
+    """One algorithm: how to learn from chunks, how to turn noise into a chunk. Works on normalised actions."""
+
+    def loss(
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars to log."""
+        ...
+
+    def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
+        """A chunk (B, H, A) from noise (B, H, A) with `nfe` evaluations of the core: a pure function."""
+        ...
+
+
+TimeSampler = Callable[[int, torch.Generator], Tensor]  # how many, from which stream -> (n,) in [0, 1]
+
+
+class UniformTimes:
+    """t ~ U[0, 1]."""
+
+    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+        return torch.rand(count, generator=rng)
+
+
+class LogitNormalTimes:
+    """t = sigmoid(mean + std n), n ~ N(0, 1) (arXiv 2505.13447)."""
+
+    def __init__(self, mean: float, std: float) -> None:
+        self.mean, self.std = mean, std
+
+    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+        return torch.sigmoid(self.mean + self.std * torch.randn(count, generator=rng))
+
+
+class HighNoiseTimes:
+    """t = 1 - span U^power: most times near 1, where the noisy action does not give the answer away.
+
+    At low noise a network can copy the action from its input and learns nothing from the pictures.
+    """
+
+    def __init__(self, span: float = 0.98, power: float = 2.0) -> None:
+        self.span, self.power = span, power
+
+    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+        return 1 - self.span * torch.rand(count, generator=rng) ** self.power
+
+
+def masked_error(error: Tensor, valid: Tensor) -> Tensor:
+    """Mean of squared errors (B, H, A) over the valid steps and all channels: (B,)."""
+    per_step = error.square().mean(-1)
+    return (per_step * valid).sum(-1) / valid.sum(-1).clamp(min=1)

@@ -1,0 +1,47 @@
+"""Multi-head attention from plain matrix products, so that forward-mode differentiation passes through it.
+
+PyTorch's fused attention kernels have no forward-mode derivative; the explicit form is exact and, at the short
+sequences of a policy, as quick.
+
+Shapes: B batch, L queries, P prefix tokens, D width, N heads, E = D / N.
+"""
+
+import torch
+from torch import Tensor, nn
+
+KeyValue = tuple[Tensor, Tensor]  # keys (B, N, E, P), transposed for the product, and values (B, N, P, E)
+
+
+class Attention(nn.Module):
+    """Self-attention whose queries also see the cached keys and values of a prefix that does not see them."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        if width % heads:
+            raise ValueError(f"width {width} is not divisible by {heads} heads")
+        self.heads = heads
+        self.scale = (width // heads) ** -0.5
+        self.query_key_value = nn.Linear(width, 3 * width, bias=False)
+        self.output = nn.Linear(width, width, bias=False)
+
+    def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
+        """Queries (B, N, L, E), scaled, and the keys and values of x (B, L, D)."""
+        q, k, v = self.query_key_value(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
+        return q.transpose(1, 2) * self.scale, (k.permute(0, 2, 3, 1), v.transpose(1, 2))
+
+    def attend(self, q: Tensor, own: KeyValue, prefix: KeyValue | None = None) -> Tensor:
+        """Attention output (B, L, D) of the queries over prefix and own tokens."""
+        keys, values = own
+        if prefix is None:
+            mixed = (q @ keys).softmax(-1) @ values
+        else:
+            # One softmax over two score blocks: cheaper than concatenating the cached keys and values each time.
+            num_prefix = prefix[0].shape[-1]
+            weights = torch.cat((q @ prefix[0], q @ keys), dim=-1).softmax(-1)
+            mixed = weights[..., :num_prefix] @ prefix[1] + weights[..., num_prefix:] @ values
+        return self.output(mixed.transpose(1, 2).flatten(2))
+
+    def forward(self, x: Tensor, prefix: KeyValue | None = None) -> Tensor:
+        q, own = self.project(x)
+        return self.attend(q, own, prefix)
+

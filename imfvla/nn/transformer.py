@@ -1,0 +1,127 @@
+"""The policy transformer: a prefix of context tokens, and action tokens that see it.
+
+- Context, time and action tokens run through the same weights. Context tokens do not see action tokens, so that
+  their keys and values are computed once per observation and serve every flow evaluation, every noise draw and the
+  Jacobian-vector product.
+- Sublayers (attention, SwiGLU) have their own RMS pre-norm and read what the residual hands them.
+- Several consecutive steps of the sequence share one token ("patch").
+- The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
+
+Shapes: B batch, H steps, A channels, K = H / patch tokens, L context tokens, D width.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from imfvla.nn.attention import Attention, KeyValue
+from imfvla.nn.embeddings import TimeEmbedding
+
+
+@dataclass(frozen=True, slots=True)
+class Conditioning:
+    """The context of a batch as every block's keys and values; made by `TransformerCore.condition`."""
+
+    blocks: tuple[KeyValue, ...]
+
+    def repeat(self, times: int) -> "Conditioning":
+        """Each row `times` times in succession: (B, ...) -> (B * times, ...)."""
+        if times == 1:
+            return self
+        return self.map(lambda x: x.repeat_interleave(times, dim=0))
+
+    def detach(self) -> "Conditioning":
+        return self.map(torch.detach)
+
+    def rows(self, index: Tensor | slice) -> "Conditioning":
+        return self.map(lambda x: x[index])
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Conditioning":
+        return Conditioning(tuple((function(keys), function(values)) for keys, values in self.blocks))
+
+
+class SwiGLU(nn.Module):
+    """W_out (silu(a) * b), (a, b) = W_in x (arXiv 2002.05202)."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.input = nn.Linear(width, 2 * hidden, bias=False)
+        self.output = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        a, b = self.input(x).chunk(2, dim=-1)
+        return self.output(F.silu(a) * b)
+
+
+class Block(nn.Module):
+    """One attention and one MLP sublayer, each with its pre-norm."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
+        super().__init__()
+        self.attention_norm = nn.RMSNorm(width)
+        self.attention = Attention(width, heads)
+        self.mlp_norm = nn.RMSNorm(width)
+        self.mlp = SwiGLU(width, int(mlp_ratio * width))
+
+
+class TransformerCore(nn.Module):
+    """Maps a noisy sequence, its times and a context to a sequence: (x, t, r | context) -> (B, H, A).
+
+    `residual` builds the residual from (num_sublayers, width): `AttentionResidual` or `StandardResidual`.
+    `max_rad` is the highest frequency of the time embeddings. Raises ValueError where `patch` does not divide `steps`.
+    """
+
+    def __init__(
+        self,
+        *,
+        steps: int,
+        channels: int,
+        width: int,
+        depth: int,
+        heads: int,
+        patch: int,
+        mlp_ratio: float,
+        max_rad: float,
+        residual: Callable[[int, int], nn.Module],
+    ) -> None:
+        super().__init__()
+        if steps % patch:
+            raise ValueError(f"core.patch must divide the {steps} steps of horizon.pred, found {patch}")
+        self.steps, self.channels, self.width, self.patch = steps, channels, width, patch
+        self.input = nn.Linear(patch * channels, width)
+        self.position = nn.Parameter(0.02 * torch.randn(steps // patch, width))
+        self.time = TimeEmbedding(width, max_rad)
+        self.interval = TimeEmbedding(width, max_rad)
+        self.blocks = nn.ModuleList(Block(width, heads, mlp_ratio) for _ in range(depth))
+        self.residual = residual(2 * depth, width)
+        self.norm = nn.RMSNorm(width)
+        self.output = nn.Linear(width, patch * channels)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    def condition(self, context: Tensor) -> Conditioning:
+        """Runs the context tokens (B, L, D) through the stack once and keeps every block's keys and values."""
+        history = self.residual.begin(context)
+        cached = []
+        for block in self.blocks:
+            queries, own = block.attention.project(block.attention_norm(history.read()))
+            cached.append(own)
+            if block is self.blocks[-1]:
+                break  # nothing reads the context tokens after the last keys and values
+            history.add(block.attention.attend(queries, own))
+            history.add(block.mlp(block.mlp_norm(history.read())))
+        return Conditioning(tuple(cached))
+
+    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+        """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
+        tokens = self.input(x.unflatten(1, (-1, self.patch)).flatten(2)) + self.position
+        times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
+        history = self.residual.begin(torch.cat((times, tokens), dim=1))
+        for block, prefix in zip(self.blocks, context.blocks, strict=True):
+            history.add(block.attention(block.attention_norm(history.read()), prefix))
+            history.add(block.mlp(block.mlp_norm(history.read())))
+        out = self.output(self.norm(history.readout()[:, 2:]))
+        return out.unflatten(-1, (self.patch, self.channels)).flatten(1, 2)

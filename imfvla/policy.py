@@ -1,0 +1,82 @@
+"""A policy: normaliser, observation encoder, core and generator, put together from a configuration.
+
+Shapes: B batch, Tp predicted steps, A action.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from torch import Tensor, nn
+
+from imfvla.errors import UserError
+from imfvla.generators.base import Generator
+from imfvla.horizon import Horizon
+from imfvla.nn.normaliser import Normaliser
+from imfvla.types import Batch, Observation
+
+
+class Policy(nn.Module):
+    """What the training loop and the evaluator know of any method: a loss and a prediction, in physical units."""
+
+    def __init__(
+        self, *, horizon: Horizon, action_dim: int, encoder: nn.Module, core: nn.Module, generator: Generator
+    ) -> None:
+        super().__init__()
+        self.horizon = horizon
+        self.action_dim = action_dim
+        self.encoder = encoder
+        self.core = core
+        self.generator = generator
+        self.action_normaliser = Normaliser(action_dim)
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(Tp, A) of the noise that one prediction starts from."""
+        return self.horizon.pred, self.action_dim
+
+    def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
+        actions = self.action_normaliser.normalise(batch.actions)
+        actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
+        context = self.core.condition(self.encoder(batch.obs))
+        loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
+        return loss.mean(), logs
+
+    def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
+        """Action chunks (B, Tp, A) in physical units from noise (B, Tp, A) and `nfe` evaluations of the core."""
+        if nfe < 1:
+            raise UserError(f"nfe, the number of flow evaluations, must be at least 1, found {nfe}.")
+        context = self.core.condition(self.encoder(obs))
+        return self.action_normaliser.denormalise(self.generator.sample(self.core, context, noise, nfe))
+
+
+def build_policy(config: Mapping[str, Any], statistics: Any | None = None) -> Policy:
+    """The policy that a composed configuration describes, with the normalisers fitted where `statistics` are given.
+
+    Without statistics the normalisers are not-a-number until a checkpoint fills them. Raises UserError where the
+    parts do not fit together.
+    """
+    try:
+        policy = Policy(
+            horizon=Horizon(**config["horizon"]),
+            action_dim=config["action_dim"],
+            encoder=instantiate(config["encoder"], _convert_="all"),
+            core=instantiate(config["core"], _convert_="all"),
+            generator=instantiate(config["generator"], _convert_="all"),
+        )
+    except KeyError as error:
+        raise UserError(f"the configuration lacks the key {error.args[0]!r} that a policy is built from.") from None
+    except Exception as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"the configured policy cannot be built: {error}") from error
+    if statistics is not None:
+        policy.encoder.state_normaliser.fit(
+            torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max)
+        )
+        policy.action_normaliser.fit(
+            torch.as_tensor(statistics.action_min), torch.as_tensor(statistics.action_max)
+        )
+    return policy
