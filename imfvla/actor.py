@@ -1,0 +1,97 @@
+"""ChunkActor: a policy that looks, predicts a chunk of actions, executes its first entries and looks again.
+
+Shapes: To observed steps, V views, H W pixels, S state, Tp predicted steps, A action.
+"""
+
+import time
+from typing import Any
+
+import numpy as np
+import torch
+
+from imfvla.episode import Decision
+from imfvla.horizon import Horizon
+from imfvla.instruction import tokenize
+from imfvla.policy import Policy
+from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
+from imfvla.types import Observation
+
+# A sound policy misses the joint limits by little and is clipped; one that misses them by this many range widths
+# has diverged, and clipping would only hide it.
+FAR = 10.0
+
+
+class ChunkActor:
+    """Plays a policy in closed loop: an `episode.Actor` that replans every `horizon.exec` control steps.
+
+    Cameras are looked at only in the steps that enter a decision. The noise of replanning k in the episode `seed` is
+    drawn from `SeedSequence([noise_seed, seed, k])` alone, so every policy with equal chunks sees the same noise.
+    """
+
+    def __init__(
+        self, policy: Policy, horizon: Horizon, nfe: int, noise_seed: int, device: torch.device | str = "cpu"
+    ) -> None:
+        self._policy = policy.eval()
+        self._horizon = horizon
+        self._nfe = nfe
+        self._noise_seed = noise_seed
+        self._device = torch.device(device)
+
+    def reset(self, env: Any, seed: int) -> None:
+        """Forgets the last episode. `env` has the limits of the actions, [rad] and [0, 1], and the instruction."""
+        spec = env.action_spec()
+        self._minimum, self._maximum = (
+            np.broadcast_to(limit, spec.shape).astype(np.float32) for limit in (spec.minimum, spec.maximum)
+        )
+        self._instruction = torch.from_numpy(tokenize(env.instruction)).unsqueeze(0).to(self._device)
+        self._seed = seed
+        self._images: dict[int, np.ndarray] = {}
+        self._states: dict[int, np.ndarray] = {}
+
+    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+        """The action of `step`; looks and replans where the horizon says so.
+
+        Raises:
+          ActionError: the part of the chunk that would be executed is not finite, or far outside the limits.
+        """
+        images = chunk = inference_ms = None
+        if self._horizon.is_observed(step):
+            images = env.look()
+            self._images[step] = np.stack(list(images.values()))
+            self._states[step] = state
+        if self._horizon.is_decision(step):
+            steps = self._horizon.observed_steps(step)
+            self._images = {s: self._images[s] for s in steps}
+            self._states = {s: self._states[s] for s in steps}
+            chunk, inference_ms = self._plan(
+                [self._images[s] for s in steps], [self._states[s] for s in steps], step // self._horizon.exec
+            )
+            self._check(chunk[: self._horizon.exec])
+            self._chunk, self._decided_at = chunk, step
+        action = np.clip(self._chunk[step - self._decided_at], self._minimum, self._maximum)
+        return Decision(action=action, executed=action, images=images, chunk=chunk, inference_ms=inference_ms)
+
+    @torch.inference_mode()
+    def _plan(
+        self, images: list[np.ndarray], states: list[np.ndarray], replanning: int
+    ) -> tuple[np.ndarray, float]:
+        """From To arrays uint8 (V, H, W, 3) and float32 (S,) to the chunk, float32 (Tp, A), and the time taken [ms]."""
+        began = time.perf_counter()
+        pixels = torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0)
+        observation = Observation(
+            images=pixels.to(self._device),
+            state=torch.from_numpy(np.stack(states)).unsqueeze(0).to(self._device),
+            instruction=self._instruction,
+        )
+        draw = np.random.default_rng(np.random.SeedSequence([self._noise_seed, self._seed, replanning]))
+        noise = torch.from_numpy(draw.standard_normal(self._policy.noise_shape, dtype=np.float32))
+        chunk = self._policy.predict(observation, noise.unsqueeze(0).to(self._device), self._nfe)
+        answer = chunk[0].float().cpu().numpy()  # waits for an accelerator
+        return answer, 1e3 * (time.perf_counter() - began)
+
+    def _check(self, actions: np.ndarray) -> None:
+        if not np.isfinite(actions).all():
+            raise ActionError(NON_FINITE)
+        margin = FAR * (self._maximum - self._minimum)
+        if (actions < self._minimum - margin).any() or (actions > self._maximum + margin).any():
+            raise ActionError(FAR_OUT_OF_RANGE)
