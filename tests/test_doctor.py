@@ -1,4 +1,4 @@
-"""tools/doctor.py and tools/install_gl.sh: what they find, what they say, and that a hanging driver cannot hang them."""
+"""tools/doctor.py and tools/install_gl.sh: what they find, what they say, and that a hanging driver ends."""
 
 import importlib.util
 import os

@@ -12,15 +12,13 @@ DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs
 
 
 def pins() -> dict[str, str]:
-    lines = (
-        line
-        for line in (ROOT / "constraints.txt").read_text().splitlines()
-        if line and not line.startswith("#")
-    )
-    return {
-        name.lower().replace("_", "-"): version
-        for name, _, version in (line.partition("==") for line in lines)
-    }
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {name.lower().replace("_", "-"): version for name, version in pairs}
+
+
+def make_targets() -> list[str]:
+    return re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
 
 
 def test_every_dependency_is_pinned():
@@ -36,8 +34,7 @@ def test_pins_name_no_place_and_no_local_version():
 
 def test_the_makefile_documents_every_target():
     printed = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
-    for target in phony:
+    for target in make_targets():
         assert re.search(rf"^  {target} +\S", printed, re.MULTILINE), target
 
 
@@ -48,10 +45,8 @@ def test_documents_name_only_what_exists(document):
         assert (ROOT / (module.replace(".", "/") + ".py")).exists(), module
     for experiment in set(re.findall(r"\+exp=(\w+)", text)):
         assert (ROOT / "conf" / "exp" / f"{experiment}.yaml").exists(), experiment
-    targets = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE).group(1).split()
-    for target in set(
-        re.findall(r"`?make ([a-z]+)\b", " ".join(re.findall(r"`[^`]+`|```.*?```", text, re.DOTALL)))
-    ):
-        assert target in targets, target
+    code = " ".join(re.findall(r"```.*?```|`[^`]+`", text, re.DOTALL))
+    for target in set(re.findall(r"\bmake ([a-z]+)\b", code)):
+        assert target in make_targets(), target
     for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (document.parent / link).exists(), link

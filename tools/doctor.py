@@ -4,7 +4,8 @@
     python tools/doctor.py                # everything; exit code 1 if a line fails
     python tools/doctor.py --only gl      # one check
 
-The frame is rendered in a process of its own with a time limit, so a graphics driver that hangs cannot hang the doctor.
+The frame is rendered in a process of its own with a time limit, so that a graphics driver that hangs cannot
+hang the doctor.
 """
 
 import argparse
@@ -59,7 +60,7 @@ def check_python() -> Finding:
     found = f"{platform.python_implementation()} {platform.python_version()} at {sys.prefix}"
     if sys.version_info < MIN_PYTHON:
         return Finding(
-            "python", found, "Python 3.11 or newer is needed: make clean, then make setup PYTHON=python3.11"
+            "python", found, "3.11 or newer is needed: make clean, then make setup PYTHON=python3.11"
         )
     return Finding("python", found)
 
@@ -71,14 +72,12 @@ def check_machine() -> Finding:
     memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     text = f"{model}, {cores} cores ({' '.join(flags) or 'no fast vector flags'}), {memory_gb:.1f} GB memory"
     if memory_gb < MIN_MEMORY_GB:
-        return Finding(
-            "machine", text, f"{MIN_MEMORY_GB:.0f} GB of memory are needed to train; use a larger machine"
-        )
+        return Finding("machine", text, f"training needs {MIN_MEMORY_GB:.0f} GB; use a larger machine")
     return Finding("machine", text)
 
 
 def check_threads() -> Finding:
-    """How many threads torch would use; more than there are cores makes small matrices up to 40 times slower."""
+    """How many threads torch would use; more than there are cores makes small matrices far slower."""
     try:
         import torch
     except ImportError as error:
@@ -94,7 +93,7 @@ def check_threads() -> Finding:
 
 
 def check_packages(constraints: Path = ROOT / "constraints.txt") -> Finding:
-    """The installed packages are those of constraints.txt (a local version such as torch's +cpu does not matter)."""
+    """The installed packages are those of constraints.txt; a local version (torch's +cpu) does not matter."""
     missing, other, num_pins = [], [], 0
     for line in constraints.read_text().splitlines():
         if not line or line.startswith("#"):
@@ -123,9 +122,7 @@ def check_gl(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
     if frame is not None:
         text = "{backend}, {renderer}, frame {digest} in {seconds:.1f} s".format(**frame)
         if not frame["has_content"]:
-            return Finding(
-                "gl", f"{text} is blank", f"try the other backend: export MUJOCO_GL=osmesa; or {GL_REMEDY}"
-            )
+            return Finding("gl", f"{text} is blank", f"export MUJOCO_GL=osmesa; or {GL_REMEDY}")
         return Finding("gl", text)
     chosen = os.environ.get("MUJOCO_GL")
     for backend in GL_BACKENDS:
@@ -169,7 +166,7 @@ def check_disk(root: Path = ROOT) -> Finding:
         return Finding(
             "disk",
             text,
-            f"free {MIN_FREE_GB:.0f} GB: old run directories under runs/ and data/ are safe to remove",
+            f"free {MIN_FREE_GB:.0f} GB, e.g. old run directories under runs/",
         )
     return Finding("disk", text)
 
@@ -186,7 +183,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
 
 
 def render_frame() -> dict:
-    """Render one frame as the simulator would: backend, renderer, digest, seconds, whether it shows anything."""
+    """Render one frame as the simulator does: backend, renderer, digest, seconds, whether it shows anything."""
     import hashlib
     import time
 
@@ -213,14 +210,8 @@ def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dic
     """The answer of `render_frame` in a process of its own, or None and what went wrong."""
     command = [sys.executable, str(Path(__file__).resolve()), "--render-frame"]
     try:
-        child = subprocess.run(
-            command,
-            env=os.environ | environment,
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-        )
+        environment = os.environ | environment
+        child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout_s)
     except subprocess.TimeoutExpired:
         return None, f"no frame within {timeout_s:.0f} s: the graphics driver hangs"
     if child.returncode == 0:
