@@ -183,7 +183,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
 
 
 def render_frame() -> dict:
-    """Render one frame as the simulator does: backend, renderer, digest, seconds, whether it shows anything."""
+    """Render one frame as the simulator does: backend, renderer, digest, seconds, whether it is blank."""
     import hashlib
     import time
 
