@@ -101,6 +101,16 @@ def test_the_exit_code_and_the_remedy_follow_the_findings(doctor, monkeypatch, c
     assert ("remedy: do this" in printed) == (remedy is not None)
 
 
+def test_a_package_that_does_not_import_is_a_finding(doctor, monkeypatch):
+    def broken():
+        import no_such_package  # noqa: F401
+
+    monkeypatch.setitem(doctor.CHECKS, "video", broken)
+    finding = doctor.run_check("video")
+    assert "no_such_package" in finding.text
+    assert "make setup" in finding.remedy
+
+
 @pytest.mark.parametrize("name", ["python", "machine", "threads", "video"])
 def test_the_other_checks_describe_this_machine(doctor, name):
     finding = doctor.CHECKS[name]()

@@ -24,15 +24,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 MIN_PYTHON = (3, 11)
 MIN_FREE_GB = 5.0  # demonstrations, frame store and one run of a task
-MIN_MEMORY_GB = 4.0
+MIN_MEMORY_GIB = 4.0
 RENDER_TIMEOUT_S = 30.0
+REINSTALL = "touch constraints.txt && make setup"
 GL_BACKENDS = ("egl", "osmesa")
 GL_REMEDY = (
     "make setup installs a GL library where it may; by hand: sudo apt-get install -y --no-install-recommends "
     "libegl1 libegl-mesa0 libgl1-mesa-dri"
 )
-CPU_FLAGS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16")  # the ones that decide the speed of fp32 and bf16
-
 # A floor, a ball and a light: enough for a frame that is neither blank nor the same everywhere.
 SCENE = """
 <mujoco>
@@ -67,22 +66,23 @@ def check_python() -> Finding:
 
 def check_machine() -> Finding:
     """CPU model, the flags that matter for speed, cores and memory."""
-    model, flags = _cpu()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    text = f"{model}, {cores} cores ({' '.join(flags) or 'no fast vector flags'}), {memory_gb:.1f} GB memory"
-    if memory_gb < MIN_MEMORY_GB:
-        return Finding("machine", text, f"training needs {MIN_MEMORY_GB:.0f} GB; use a larger machine")
+    from imfvla.fingerprint import machine
+
+    found = machine()
+    flags = " ".join(found["cpu_flags"]) or "no fast vector flags"
+    text = "{cpu}, {physical_cores} cores ({flags}), {memory_gib} GiB memory".format(**found, flags=flags)
+    if found["memory_gib"] < MIN_MEMORY_GIB:
+        return Finding("machine", text, f"training needs {MIN_MEMORY_GIB:.0f} GiB; use a larger machine")
     return Finding("machine", text)
 
 
 def check_threads() -> Finding:
     """How many threads torch would use; more than there are cores makes small matrices far slower."""
-    try:
-        import torch
-    except ImportError as error:
-        return Finding("threads", f"torch does not import: {error}", "make setup")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    import torch
+
+    from imfvla.fingerprint import physical_cores
+
+    cores = physical_cores()
     setting = os.environ.get("OMP_NUM_THREADS", "unset")
     text = f"torch uses {torch.get_num_threads()} threads on {cores} cores (OMP_NUM_THREADS {setting})"
     if torch.cuda.is_available():
@@ -110,7 +110,7 @@ def check_packages(constraints: Path = ROOT / "constraints.txt") -> Finding:
     if missing or other:
         problems = [f"{name} is missing" for name in missing] + other
         shown = ", ".join(problems[:4]) + (f" and {len(problems) - 4} more" if len(problems) > 4 else "")
-        return Finding("packages", shown, "touch constraints.txt && make setup")
+        return Finding("packages", shown, REINSTALL)
     names = ("torch", "mujoco", "dm-control", "numpy")
     versions = ", ".join(f"{name} {metadata.version(name)}" for name in names)
     return Finding("packages", f"all {num_pins} as pinned: {versions}")
@@ -131,25 +131,22 @@ def check_gl(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
         frame, _ = _render_in_child({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}, timeout_s)
         if frame is not None and frame["has_content"]:
             return Finding("gl", f"{problem}; {backend} renders", f"export MUJOCO_GL={backend}")
-    return Finding("gl", problem, GL_REMEDY)
+    return Finding("gl", problem, REINSTALL if "ModuleNotFoundError" in problem else GL_REMEDY)
 
 
 def check_video() -> Finding:
     """PNG (episodes) and H.264 (videos) can be written."""
-    try:
-        import av
-        import cv2
-        import numpy as np
+    import av
+    import cv2
+    import numpy as np
 
-        image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-        encoded, png = cv2.imencode(".png", image)
-        lossless = encoded and bool((cv2.imdecode(png, cv2.IMREAD_COLOR) == image).all())
-        codec = av.Codec("libx264", "w").long_name
-    except Exception as error:
-        return Finding("video", f"{type(error).__name__}: {error}", "touch constraints.txt && make setup")
-    if not lossless:
-        return Finding("video", "PNG is not read back as written", "touch constraints.txt && make setup")
-    return Finding("video", f"PNG lossless, {codec}")
+    image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    encoded, png = cv2.imencode(".png", image)
+    if not encoded or not (cv2.imdecode(png, cv2.IMREAD_COLOR) == image).all():
+        return Finding("video", "PNG is not read back as written", REINSTALL)
+    if "libx264" not in av.codecs_available:
+        return Finding("video", "PyAV has no H.264 encoder (libx264)", REINSTALL)
+    return Finding("video", "PNG read back as written, H.264 encoder libx264")
 
 
 def check_disk(root: Path = ROOT) -> Finding:
@@ -187,7 +184,6 @@ def render_frame() -> dict:
     import hashlib
     import time
 
-    sys.path.insert(0, str(ROOT))
     from imfvla.gl import select_gl_backend
 
     start = time.perf_counter()
@@ -195,8 +191,11 @@ def render_frame() -> dict:
     from dm_control import mujoco
     from OpenGL import GL
 
-    pixels = mujoco.Physics.from_xml_string(SCENE).render(64, 64, camera_id="front")
-    renderer = GL.glGetString(GL.GL_RENDERER)
+    physics = mujoco.Physics.from_xml_string(SCENE)
+    pixels = physics.render(64, 64, camera_id="front")
+    with physics.contexts.gl.make_current() as context:
+        renderer = context.call(GL.glGetString, GL.GL_RENDERER)
+    physics.free()
     return {
         "backend": backend,
         "renderer": renderer.decode() if renderer else "unknown renderer",
@@ -220,18 +219,12 @@ def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dic
     return None, f"no frame could be rendered: {last}"
 
 
-def _cpu() -> tuple[str, list[str]]:
-    """Model name and the flags of `CPU_FLAGS` that this CPU has."""
-    model, flags = platform.processor() or platform.machine(), []
-    cpuinfo = Path("/proc/cpuinfo")
-    for line in cpuinfo.read_text().splitlines() if cpuinfo.exists() else ():
-        key, _, value = line.partition(":")
-        if key.strip() == "model name":
-            model = value.strip()
-        elif key.strip() == "flags":
-            flags = [flag for flag in CPU_FLAGS if flag in value.split()]
-            break
-    return model, flags
+def run_check(name: str) -> Finding:
+    """The finding of one check; a package that does not import is a finding too."""
+    try:
+        return CHECKS[name]()
+    except ImportError as error:
+        return Finding(name, f"{type(error).__name__}: {error}", REINSTALL)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -246,7 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     num_failed = 0
     for name in options.only or CHECKS:
-        finding = CHECKS[name]()
+        finding = run_check(name)
         print(f"{'ok  ' if finding.remedy is None else 'FAIL'}  {finding.name:<9} {finding.text}", flush=True)
         if finding.remedy is not None:
             num_failed += 1
@@ -255,4 +248,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(ROOT))  # works before the package is installed, and says then what is missing
     sys.exit(main())

@@ -26,10 +26,11 @@ else
 fi
 
 echo "No OpenGL library renders here; installing $egl"
-"${as_root[@]}" apt-get update -q || true # a stale list may still do; the install says if not
+"${as_root[@]}" apt-get update -qq || true # a stale list may still do; the install says if not
+install=("${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends --no-upgrade)
 # shellcheck disable=SC2086
-"${as_root[@]}" apt-get install -q -y --no-install-recommends $egl || give_up "and apt-get could not install $egl."
+"${install[@]}" $egl || give_up "and apt-get could not install $egl."
 renders && exit 0
 echo "EGL does not render here; installing $osmesa"
-"${as_root[@]}" apt-get install -q -y --no-install-recommends $osmesa || give_up "and apt-get could not install $osmesa."
-renders || give_up "even with $egl and $osmesa installed; tools/doctor.py says why."
+"${install[@]}" $osmesa || give_up "and apt-get could not install $osmesa."
+.venv/bin/python tools/doctor.py --only gl >&2 # its line says why, and its exit code is ours
