@@ -10,19 +10,27 @@ from imfvla.recording import McapSink
 
 VIEWS = ("front", "top", "r_wrist")
 INSTRUCTION = "put the peg into the socket"
+PARAPHRASES = ("insert the peg", "push the peg into the hole")
 
 
 class StillScene:
-    """Stands where an environment would: one red box, and frames in which a light square moves with `position`."""
+    """Stands where an environment would: a red box, and frames where a square moves with `position`."""
 
     def __init__(self, views: tuple[str, ...], image_size: tuple[int, int]) -> None:
         self.views, self.image_size, self.position = views, image_size, 0.0
         model = SimpleNamespace(
-            nbody=2, names=b"synthetic\0world\0box\0", name_bodyadr=np.array([10, 16]),
-            ngeom=1, geom_group=np.zeros(1, int), geom_bodyid=np.ones(1, int), geom_matid=np.full(1, -1),
-            geom_rgba=np.array([[1.0, 0.0, 0.0, 1.0]]), geom_type=np.full(1, 6), geom_size=np.full((1, 3), 0.1),
-            geom_pos=np.zeros((1, 3)), geom_quat=np.array([[1.0, 0.0, 0.0, 0.0]]),
-        )  # fmt: skip
+            names=b"synthetic\0world\0box\0",
+            name_bodyadr=np.array([10, 16]),
+            ngeom=1,
+            geom_group=np.zeros(1, int),
+            geom_bodyid=np.ones(1, int),
+            geom_matid=np.full(1, -1),
+            geom_rgba=np.array([[1.0, 0.0, 0.0, 1.0]]),
+            geom_type=np.full(1, 6),
+            geom_size=np.full((1, 3), 0.1),
+            geom_pos=np.zeros((1, 3)),
+            geom_quat=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        )
         data = SimpleNamespace(xpos=np.zeros((2, 3)), xquat=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
         self.physics = SimpleNamespace(model=model, data=data)
 
@@ -61,10 +69,16 @@ def write_episode(
     actions = synthetic_actions(seed, num_steps)
     states = np.concatenate([actions[:1], actions[:-1]])
     info = EpisodeInfo(
-        task=task, kind="demonstration", seed=seed, start_digest=f"{seed:016x}", instruction=INSTRUCTION,
-        views=views, image_size=image_size, config={"name": "synthetic"},
-        metadata={"paraphrases": ["insert the peg", "push the peg into the hole"]},
-    )  # fmt: skip
+        task=task,
+        kind="demonstration",
+        seed=seed,
+        start_digest=f"{seed:016x}",
+        instruction=INSTRUCTION,
+        views=views,
+        image_size=image_size,
+        config={"name": "synthetic"},
+        metadata={"paraphrases": PARAPHRASES},
+    )
     sink = McapSink(path, render_every=camera_every)
     env.position = states[0, 0]
     sink.begin(env, info)
@@ -75,10 +89,18 @@ def write_episode(
         sink.step(env, Step(index, index / CONTROL_HZ, states[index], decision, 0.0, 0))
     sink.end(
         EpisodeResult(
-            seed=seed, start_digest=f"{seed:016x}", num_steps=num_steps, total_reward=0.0, max_reward=0.0,
-            success=False, first_step_of_stage=(-1,) * 5, failure=None, inference_ms=(), wall_s=0.0,
+            seed=seed,
+            start_digest=f"{seed:016x}",
+            num_steps=num_steps,
+            total_reward=0.0,
+            max_reward=0.0,
+            success=False,
+            first_step_of_stage=(-1,) * 5,
+            failure=None,
+            inference_ms=(),
+            wall_s=0.0,
         )
-    )  # fmt: skip
+    )
 
 
 def write_demonstrations(directory: Path, *, num_episodes: int = 3, **episode) -> Path:

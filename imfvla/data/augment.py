@@ -1,0 +1,89 @@
+"""Image augmentation in integer arithmetic, so that a seed gives the same bytes on every machine.
+
+Shapes: B batch, To observed steps, V views, H W pixels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from imfvla.errors import UserError
+
+FRACTION_BITS = 7  # gains are multiples of 1/128
+MAX_GAIN = 1.98  # keeps (pixel - 128) * gain and its rounding within int16
+BLOCK = 4  # samples at a time: their int16 copies stay in the second-level cache
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """Random shifts and colours, one draw for each sample and view that all its observed steps share.
+
+    A shift moves the picture by up to `shift_px` pixels along each axis and repeats its edge (DrQ, arXiv
+    2004.13649). Colours become `(x - 128) * gain + 128 + offset`, cut to 0 ... 255, with the gain drawn from
+    `1 +- contrast` times, for each of R, G and B, `1 +- color`, and the offset from `+-brightness * 255`.
+    """
+
+    shift_px: int = 2
+    brightness: float = 0.1
+    contrast: float = 0.1
+    color: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("shift_px", "brightness", "contrast", "color"):
+            if getattr(self, name) < 0:
+                raise UserError(f"augmentation {name} must not be negative, found {getattr(self, name)}.")
+        if (gain := (1 + self.contrast) * (1 + self.color)) > MAX_GAIN:
+            raise UserError(
+                f"augmentation (1 + contrast) * (1 + color) must stay below {MAX_GAIN}, found {gain:.3g}; "
+                "lower contrast or color."
+            )
+
+    def __call__(self, images: Tensor, rng: np.random.Generator) -> Tensor:
+        """Augmented copy of uint8 images (B, To, V, 3, H, W)."""
+        pixels = images.numpy()
+        shift = rng.integers(-self.shift_px, self.shift_px + 1, (pixels.shape[0], pixels.shape[2], 2))
+        gain, offset = self._draw_colors(pixels.shape[0], pixels.shape[2], rng)
+        augmented = np.empty_like(pixels)
+        for sample in range(pixels.shape[0]):
+            for view in range(pixels.shape[2]):
+                _shift(pixels[sample, :, view], augmented[sample, :, view], *shift[sample, view])
+        if self.brightness or self.contrast or self.color:
+            _recolor(augmented, gain, offset)
+        return torch.from_numpy(augmented)
+
+    def _draw_colors(self, b: int, v: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """int16 gains in multiples of 1/128 and offsets, both broadcasting over (B, To, V, 3, H, W)."""
+        contrast = 1 + rng.uniform(-self.contrast, self.contrast, (b, 1, v, 1, 1, 1))
+        color = 1 + rng.uniform(-self.color, self.color, (b, 1, v, 3, 1, 1))
+        offset = 128 + 255 * rng.uniform(-self.brightness, self.brightness, (b, 1, v, 1, 1, 1))
+        gain = np.rint(contrast * color * 2**FRACTION_BITS)
+        return gain.astype(np.int16), np.rint(offset).astype(np.int16)
+
+
+def _shift(source: np.ndarray, target: np.ndarray, down: int, right: int) -> None:
+    """Copies source (..., H, W) into target, moved by whole pixels, its edge repeated."""
+    height, width = source.shape[-2:]
+    top, bottom = max(down, 0), height + min(down, 0)
+    left, end = max(right, 0), width + min(right, 0)
+    target[..., top:bottom, left:end] = source[..., top - down : bottom - down, left - right : end - right]
+    target[..., top:bottom, :left] = target[..., top:bottom, left : left + 1]
+    target[..., top:bottom, end:] = target[..., top:bottom, end - 1 : end]
+    target[..., :top, :] = target[..., top : top + 1, :]
+    target[..., bottom:, :] = target[..., bottom - 1 : bottom, :]
+
+
+def _recolor(pixels: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> None:
+    """In place `(pixels - 128) * gain / 128 + offset`, rounded and cut to uint8."""
+    work = np.empty((BLOCK, *pixels.shape[1:]), np.int16)
+    for first in range(0, len(pixels), BLOCK):
+        block = slice(first, first + BLOCK)
+        values = work[: len(pixels[block])]
+        np.subtract(pixels[block], np.int16(128), out=values, dtype=np.int16)
+        values *= gain[block]
+        values += 1 << (FRACTION_BITS - 1)
+        values >>= FRACTION_BITS
+        values += offset[block]
+        np.clip(values, 0, 255, out=values)
+        pixels[block] = values

@@ -1,0 +1,225 @@
+"""Recorded episodes as memory-mapped arrays, decoded once for all epochs and runs.
+
+Shapes: N frames, V views, H W pixels, T control steps of all episodes, S state, A action.
+"""
+
+import fcntl
+import hashlib
+import json
+import shutil
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from imfvla.errors import UserError
+from imfvla.recording import Episode, read_episode, read_index
+
+FORMAT = 1
+IMAGES = "images.raw"
+NUM_DECODERS = 2  # threads: decompression, pictures and checksums run outside the interpreter lock
+
+Progress = Callable[[int, int], None]  # told of (episodes done, episodes in all)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredEpisode:
+    """Where an episode lies in the store's arrays."""
+
+    file: str
+    task: str
+    instructions: tuple[str, ...]  # the recorded sentence, then its paraphrases
+    num_steps: int
+    first_row: int  # of state and action
+    first_frame: int  # of images
+    image_steps: np.ndarray  # int64 (K,)  steps of its frames, within the episode
+
+
+@dataclass(frozen=True, slots=True)
+class FrameStore:
+    """Arrays of all episodes, one after the other, in the order of their file names."""
+
+    path: Path
+    views: tuple[str, ...]
+    image_size: tuple[int, int]  # (H, W) [px]
+    episodes: tuple[StoredEpisode, ...]
+    images: np.ndarray  # uint8 (N, V, 3, H, W), memory-mapped; channels first, as batches want them
+    state: np.ndarray  # float32 (T, S)
+    action: np.ndarray  # float32 (T, A)  clean
+
+    @classmethod
+    def open(cls, path: str | Path) -> "FrameStore":
+        """The store that `build` left at `path`. Raises UserError where there is none or it is damaged."""
+        path = Path(path)
+        try:
+            meta = json.loads((path / "meta.json").read_text())
+            if meta["format"] != FORMAT:
+                raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
+            image_steps = np.load(path / "image_steps.npy")
+            state, action = np.load(path / "state.npy"), np.load(path / "action.npy")
+            shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
+            images = np.asarray(np.memmap(path / IMAGES, np.uint8, "r", shape=shape))
+            episodes, row, frame = [], 0, 0
+            for entry in meta["episodes"]:
+                steps = image_steps[frame : frame + entry.pop("num_frames")]
+                entry["instructions"] = tuple(entry["instructions"])
+                episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
+                row, frame = row + entry["num_steps"], frame + len(steps)
+            if not len(state) == len(action) == row or len(image_steps) != frame:
+                raise ValueError("its arrays differ in length")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"Frame store {path} cannot be read ({error}): delete it and run again."
+            ) from error
+        views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
+        return cls(path, views, image_size, tuple(episodes), images, state, action)
+
+    @classmethod
+    def build(
+        cls,
+        directory: str | Path,
+        store_path: str | Path,
+        image_size: Sequence[int],
+        views: Sequence[str],
+        *,
+        progress: Progress | None = None,
+    ) -> "FrameStore":
+        """The store of all `*.mcap` of `directory`; one that is there already is kept while it is up to date.
+
+        It is out of date once files, views or image size are others. Episodes are decoded a few at a time,
+        so memory stays low; frames of another size are resampled. Raises UserError where recordings are
+        missing, damaged or without a view, and where the disk is full; a store that was there is replaced
+        by a complete one only. Concurrent builds wait for each other.
+        """
+        directory, store_path = Path(directory), Path(store_path)
+        files = sorted(directory.glob("*.mcap"))
+        if not files:
+            raise UserError(
+                f"No recordings (*.mcap) in {directory}: collect demonstrations with "
+                "`python -m imfvla.collect`, or correct the directory."
+            )
+        source = _source(files, tuple(views), tuple(image_size))
+        store_path.parent.mkdir(parents=True, exist_ok=True)
+        with _lock(store_path):
+            if not _is_current(store_path, source):
+                _write(files, store_path, source, progress or (lambda done, total: None))
+        return cls.open(store_path)
+
+
+def _source(files: list[Path], views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
+    """What a store is made of: its digest tells whether it is up to date."""
+    digest = hashlib.sha256(json.dumps([FORMAT, views, image_size]).encode())
+    num_frames = 0
+    for file in files:
+        index = read_index(file)
+        digest.update(json.dumps([file.name, index.num_bytes, index.data_crc]).encode())
+        num_frames += max((index.num_frames.get(view, 0) for view in views), default=0)
+    if num_frames == 0:
+        raise UserError(
+            f"The recordings in {files[0].parent} have no frames of {', '.join(views) or 'any view'}: "
+            "change observation.views, or collect again with these views."
+        )
+    return {
+        "format": FORMAT,
+        "digest": digest.hexdigest(),
+        "views": list(views),
+        "image_size": list(image_size),
+        "num_frames": num_frames,
+    }
+
+
+def _is_current(store_path: Path, source: dict[str, Any]) -> bool:
+    try:
+        return json.loads((store_path / "meta.json").read_text())["digest"] == source["digest"]
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+@contextmanager
+def _lock(store_path: Path) -> Iterator[None]:
+    with open(store_path.with_name(f".{store_path.name}.lock"), "w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def _write(files: list[Path], store_path: Path, source: dict[str, Any], progress: Progress) -> None:
+    """Writes a complete store beside `store_path` and moves it there."""
+    part = store_path.with_name(f".{store_path.name}.part")
+    height, width = source["image_size"]
+    needed = source["num_frames"] * len(source["views"]) * 3 * height * width
+    shutil.rmtree(part, ignore_errors=True)
+    if (free := shutil.disk_usage(store_path.parent).free) < needed:
+        raise UserError(
+            f"Frame store {store_path} needs {needed / 1e9:.1f} GB, found {free / 1e9:.1f} GB free: "
+            "free disk space, or lower observation.image_size or the number of views."
+        )
+    try:
+        part.mkdir()
+        _write_arrays(files, part, source, progress)
+        shutil.rmtree(store_path, ignore_errors=True)
+        part.rename(store_path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(
+            f"Cannot write frame store {store_path}: {reason}. Free disk space and run again."
+        ) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_arrays(files: list[Path], part: Path, source: dict[str, Any], progress: Progress) -> None:
+    entries, steps, states, actions = [], [], [], []
+    with open(part / IMAGES, "wb") as stream:
+        for episode, frames in _decoded(files, source["views"], source["image_size"]):
+            stream.write(frames)
+            entry = {
+                "file": episode.path.name,
+                "task": episode.info.task,
+                "instructions": [episode.info.instruction, *episode.info.metadata.get("paraphrases", ())],
+                "num_steps": len(episode.state),
+                "num_frames": len(episode.image_steps),
+            }
+            entries.append(entry)
+            steps.append(episode.image_steps)
+            states.append(episode.state)
+            actions.append(episode.action)
+            progress(len(entries), len(files))
+    np.save(part / "image_steps.npy", np.concatenate(steps))
+    np.save(part / "state.npy", np.concatenate(states))
+    np.save(part / "action.npy", np.concatenate(actions))
+    (part / "meta.json").write_text(json.dumps(source | {"episodes": entries}, indent=1))
+
+
+def _decoded(
+    files: list[Path], views: Sequence[str], image_size: Sequence[int]
+) -> Iterator[tuple[Episode, np.ndarray]]:
+    """Episodes in order with their frames, decoded by threads that stay a few episodes ahead."""
+    ahead: deque[Future[tuple[Episode, np.ndarray]]] = deque()
+    with ThreadPoolExecutor(NUM_DECODERS) as threads:
+        for file in files:
+            ahead.append(threads.submit(_decode, file, views, image_size))
+            if len(ahead) > 2 * NUM_DECODERS:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+
+
+def _decode(file: Path, views: Sequence[str], image_size: Sequence[int]) -> tuple[Episode, np.ndarray]:
+    """The episode and its frames: contiguous uint8 (K, V, 3, H, W)."""
+    episode = read_episode(file, images=views)
+    if not (np.isfinite(episode.state).all() and np.isfinite(episode.action).all()):
+        raise UserError(f"Recording {file} has a state or an action that is not finite: delete it.")
+    height, width = image_size
+    frames = np.empty((len(episode.image_steps), len(views), 3, height, width), np.uint8)
+    for number, view in enumerate(views):
+        for frame, picture in zip(frames[:, number], episode.images[view], strict=True):
+            if picture.shape[:2] != (height, width):
+                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+            frame[...] = picture.transpose(2, 0, 1)
+    return replace(episode, images={}), frames

@@ -1,0 +1,88 @@
+"""Batches prepared in the background while the previous one trains."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from imfvla.data.augment import Augmentation
+from imfvla.data.sampler import ResumableSampler
+from imfvla.data.windows import Windows
+from imfvla.types import Batch
+
+RANDOM_STREAM = 1  # apart from the sampler's SeedSequence([seed, epoch]) by its length
+
+
+class Loader(Iterator[Batch]):
+    """Endless iterator over the batches of `sampler`, `prefetch` of them prepared ahead by one thread.
+
+    Batch i, with its instructions and augmentation, depends on the sampler's seed and i alone. The state
+    counts batches handed out, not those prepared, so a run that resumes sees exactly what it would have
+    seen. `wait_s` adds up the time [s] that the caller waited for data.
+    """
+
+    def __init__(
+        self,
+        windows: Windows,
+        sampler: ResumableSampler,
+        *,
+        augment: Augmentation | None = None,
+        prefetch: int = 2,
+    ) -> None:
+        if prefetch < 1:
+            raise ValueError(f"prefetch must be at least 1, found {prefetch}.")
+        self.wait_s = 0.0
+        self._windows = windows
+        self._sampler = sampler
+        self._augment = augment
+        self._prefetch = prefetch
+        self._ahead: deque[Future[Batch]] = deque()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="loader")
+
+    def __next__(self) -> Batch:
+        first = self._sampler.next_batch
+        while len(self._ahead) <= self._prefetch:
+            self._ahead.append(self._thread.submit(self.batch, first + len(self._ahead)))
+        began = time.perf_counter()
+        batch = self._ahead.popleft().result()
+        self.wait_s += time.perf_counter() - began
+        self._sampler.next_batch += 1
+        return batch
+
+    def batch(self, number: int) -> Batch:
+        """Batch `number`, whatever was drawn before."""
+        seeds = np.random.SeedSequence([self._sampler.seed, RANDOM_STREAM, number])
+        rng = np.random.default_rng(seeds)
+        batch = self._windows.batch(self._sampler.batch(number), rng)
+        if self._augment is None:
+            return batch
+        return replace(batch, obs=replace(batch.obs, images=self._augment(batch.obs.images, rng)))
+
+    def state_dict(self) -> dict[str, int]:
+        """The sampler's state: the next batch to hand out."""
+        return self._sampler.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where `state` was taken; what was prepared ahead is dropped."""
+        self._sampler.load_state_dict(state)
+        self._drop()
+
+    def close(self) -> None:
+        """Stops the background thread."""
+        self._drop()
+        self._thread.shutdown()
+
+    def __enter__(self) -> "Loader":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _drop(self) -> None:
+        for future in self._ahead:
+            future.cancel()
+        self._ahead.clear()
