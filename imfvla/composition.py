@@ -42,6 +42,7 @@ def compose(config_name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
 
     Raises UserError where an override, a group's choice or a key is not known.
     """
+    register_resolvers()
     try:
         refuse_added_keys(config_name, overrides)
         with initialize_config_dir(config_dir=str(_config_directory()), version_base=VERSION_BASE):
@@ -74,8 +75,9 @@ def run_name(overrides: Sequence[str]) -> str:
 
 
 def register_resolvers() -> None:
-    """Makes `${run_name:...}` known to the configs. May be called again."""
+    """Makes `${run_name:overrides}` and `${count:list}` known to the configs. May be called again."""
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+    OmegaConf.register_new_resolver("count", len, replace=True)
 
 
 def refuse_added_keys(config_name: str, overrides: Sequence[str]) -> None:

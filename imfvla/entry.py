@@ -30,7 +30,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[dict[str, Any]], None]]
     on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C; 1
     with a traceback after anything else. In a sweep (`-m`) all jobs run; the failures are listed at the end.
     The config overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory,
-    see `output_directory`, and its train.log) or both with `plain` (nothing written, messages on the terminal).
+    see `output_directory`, and its train.log) or both with `plain` (nothing written).
     """
 
     def decorate(function: Callable[[dict[str, Any]], None]) -> Callable[..., None]:

@@ -1,0 +1,66 @@
+"""Files that are whole or absent: written beside their place, forced to disk, then renamed."""
+
+import errno
+import json
+import os
+from collections.abc import Callable
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+
+PARTIAL = ".tmp"  # suffix of what is being written; a leftover belongs to a killed process and may be deleted
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """`write(temporary)` fills a file beside `path`, which then takes its place in one step.
+
+    After a kill or a failed write the old file is still there, whole. Raises UserError on a write error.
+    """
+    temporary = path.with_name(path.name + PARTIAL)
+    with clear_write_errors(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write(temporary)
+            sync(temporary)
+            os.replace(temporary, path)
+            sync(path.parent)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Atomic. Raises UserError on a write error."""
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Atomic, indented, keys in their order. Raises UserError on a write error."""
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def sync(path: Path) -> None:
+    """Forces a file's content, or a directory's entries, to disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def clear_write_errors(path: Path) -> Any:
+    """Turns an OSError inside into a UserError that names the path and the remedy."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            remedy = "free some space there and run the same command again; what was written before is intact"
+        else:
+            remedy = (
+                "check that the directory is there and may be written to, then run the same command again"
+            )
+        raise UserError(f"Cannot write {path}: {error.strerror or error}; {remedy}.") from error

@@ -1,0 +1,181 @@
+"""The run directory: the contract between training, evaluation and tables. Needs neither torch nor mujoco.
+
+config.yaml  status.json  train.log  metrics.jsonl  tensorboard/
+checkpoints/last/state.safetensors            to resume from, bit for bit
+checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
+rollouts/<evaluation>/
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from imfvla.errors import UserError
+from imfvla.files import write_json, write_text
+
+RUNNING, DONE, FAILED = "running", "done", "failed"
+
+
+class RunDirectory:
+    """Paths and small files of one run. Reading creates nothing."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def last_state(self) -> Path:
+        return self.checkpoints / "last" / "state.safetensors"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
+
+    def rollouts(self, name: str) -> Path:
+        """Where the evaluation `name` keeps its episodes."""
+        return self.path / "rollouts" / name
+
+    def weights_directory(self, step: int) -> Path:
+        return self.checkpoints / f"step-{step}"
+
+    def weight_steps(self) -> list[int]:
+        """Training steps whose weights are kept, ascending."""
+        found = (re.fullmatch(r"step-(\d+)", path.name) for path in self.checkpoints.glob("step-*"))
+        return sorted(int(match.group(1)) for match in found if match)
+
+    def policy_weights(self, step: int | str = "last") -> Path:
+        """`policy.safetensors` of a step, or of the last one kept. Raises UserError where there is none."""
+        steps = self.weight_steps()
+        if not steps:
+            raise UserError(
+                f"{self.path} has no weights in checkpoints/step-*: wanted a run that has trained."
+            )
+        if step == "last":
+            step = steps[-1]
+        if step not in steps:
+            kept = ", ".join(str(known) for known in steps)
+            raise UserError(
+                f"{self.checkpoints} has no weights of step {step!r}: kept are {kept}, or take last."
+            )
+        return self.weights_directory(int(step)) / "policy.safetensors"
+
+    def config(self) -> dict[str, Any]:
+        """The resolved config of the run. Raises UserError where there is none or the file is broken."""
+        path = self.path / "config.yaml"
+        try:
+            config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UserError(f"{self.path} is not a run directory: {path.name} is missing there.") from None
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
+        if not isinstance(config, dict):
+            raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
+        return config
+
+    def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
+        """Makes the directory this config's: writes config.yaml, or compares with the one that is there.
+
+        `ignored` keys may differ (they say how a run executes). Raises UserError naming those that do differ.
+        """
+        if not (self.path / "config.yaml").exists():
+            write_text(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False))
+            return
+        differing = differences(self.config(), plain(config), ignored)
+        if differing:
+            raise UserError(
+                f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another name=..., "
+                "or delete that directory if it is not needed."
+            )
+
+    def status(self) -> dict[str, Any]:
+        """The content of status.json, {} before the first one. Raises UserError where it is broken."""
+        path = self.path / "status.json"
+        if not path.exists():
+            return {}
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except json.JSONDecodeError as error:
+            raise UserError(f"{path} cannot be read as JSON: {error}; delete it and run again.") from error
+
+    def write_status(self, state: str, **details: Any) -> None:
+        """state: running, done or failed; `details` such as step, error, traceback replace those of before."""
+        write_json(
+            self.path / "status.json",
+            {"state": state, "updated": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **details},
+        )
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Held while a process trains here. Raises UserError where another one does."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        with open(self.path / ".lock", "a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                file.seek(0)
+                owner = file.read().strip() or "unknown"
+                raise UserError(
+                    f"{self.path} is in use by process {owner}: wait for it or stop it."
+                ) from None
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
+            yield
+
+
+def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:
+    """16 hex digits that change with any key but the ignored ones."""
+    entries = {key: value for key, value in flatten(plain(config)).items() if not _is_ignored(key, ignored)}
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> list[str]:
+    """One "key was a, is b" per key of nested mappings whose values differ."""
+    before, after = flatten(old), flatten(new)
+    keys = [key for key in {**before, **after} if not _is_ignored(key, ignored)]
+    absent = object()
+    return [
+        f"{key} was {_shown(before, key)}, is {_shown(after, key)}"
+        for key in keys
+        if before.get(key, absent) != after.get(key, absent)
+    ]
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one mapping from dotted keys to leaves; lists are leaves."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def plain(value: Any) -> Any:
+    """The same with dicts and lists only, as YAML gives it back."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _is_ignored(key: str, ignored: tuple[str, ...]) -> bool:
+    return any(key == name or key.startswith(f"{name}.") for name in ignored)
+
+
+def _shown(flat: Mapping[str, Any], key: str) -> str:
+    return repr(flat[key]) if key in flat else "absent"

@@ -1,0 +1,78 @@
+"""Metrics of a training run: one row of means per interval in metrics.jsonl, and the same in TensorBoard."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch.utils.tensorboard import SummaryWriter
+
+from imfvla.errors import UserError
+from imfvla.files import clear_write_errors, write_text
+from imfvla.run_directory import RunDirectory
+
+
+class MetricsLogger:
+    """Averages scalars over the steps between rows.
+
+    After a kill, rows later than the resumed step are cut off, so that every step has one row; with the sums
+    that `state` returns, the first row after resuming equals the one of an uninterrupted run.
+    """
+
+    def __init__(self, run: RunDirectory, resumed_step: int, state: Mapping[str, Any] | None = None) -> None:
+        self._path = run.metrics
+        _truncate(self._path, resumed_step)
+        with clear_write_errors(self._path):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115
+        self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
+        self._sums: dict[str, float] = dict(state["sums"]) if state else {}
+        self._count: int = state["count"] if state else 0
+
+    def add(self, scalars: Mapping[str, float]) -> None:
+        """Takes in what one step measured."""
+        for name, value in scalars.items():
+            self._sums[name] = self._sums.get(name, 0.0) + float(value)
+        self._count += 1
+
+    def write(self, step: int, **extra: float) -> None:
+        """One row: the means since the last row, and `extra` as it is."""
+        row = {name: total / self._count for name, total in self._sums.items()} | extra
+        with clear_write_errors(self._path):
+            self._file.write(json.dumps({"step": step, **row}) + "\n")
+            self._file.flush()
+        for name, value in row.items():
+            self._tensorboard.add_scalar(name, value, step)
+        self._sums, self._count = {}, 0
+
+    def state(self) -> dict[str, Any]:
+        """Sums of the interval that has begun; JSON-able."""
+        return {"sums": dict(self._sums), "count": self._count}
+
+    def close(self) -> None:
+        self._file.close()
+        self._tensorboard.close()
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The rows of metrics.jsonl, without a last line that a kill cut off. Raises UserError on broken lines."""
+    if not path.exists():
+        return []
+    rows = []
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            if number < len(lines):
+                raise UserError(
+                    f"{path}, line {number} is not JSON: {error}; restore or delete the file."
+                ) from error
+    return rows
+
+
+def _truncate(path: Path, step: int) -> None:
+    """Keeps the rows up to `step`."""
+    if path.exists():
+        kept = [row for row in read_metrics(path) if row["step"] <= step]
+        write_text(path, "".join(json.dumps(row) + "\n" for row in kept))

@@ -1,0 +1,207 @@
+"""The training loop: any policy with a loss, batches that are a function of their number, a run directory.
+
+Step i (0-based) takes batch i, random numbers from SeedSequence([seed, stream, i]) and the learning rate of i. So
+the state to resume from is the weights, their average and AdamW's moments, and a resumed run equals an
+uninterrupted one bit for bit (same machine, same number of threads).
+"""
+
+import logging
+import math
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from imfvla.errors import UserError
+from imfvla.fingerprint import code_version, physical_cores
+from imfvla.progress import Progress
+from imfvla.run_directory import RunDirectory
+from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
+from imfvla.training.ema import Ema
+from imfvla.training.logger import MetricsLogger
+from imfvla.training.optimiser import make_optimiser
+from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.precision import autocast, choose_precision
+from imfvla.training.schedule import learning_rate
+from imfvla.types import Batch
+
+LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
+log = logging.getLogger(__name__)
+
+
+class Trainable(Protocol):
+    """What the loop asks of a policy, which is also an nn.Module."""
+
+    def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
+
+
+class Batches(Protocol):
+    """Endless batches with a state, such as `imfvla.data.Loader`."""
+
+    def __next__(self) -> Batch: ...
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def close(self) -> None: ...
+
+
+class Trainer:
+    """Trains `policy` in `run` up to `options.steps`, from the state that is there if there is one.
+
+    `batches` begins at batch 0 and is closed at the end. `description` (JSON-able) goes beside the weights.
+    """
+
+    def __init__(
+        self,
+        policy: nn.Module,
+        batches: Batches,
+        run: RunDirectory,
+        options: TrainingOptions,
+        optim: OptimOptions,
+        *,
+        seed: int,
+        description: Mapping[str, Any],
+    ) -> None:
+        torch.set_num_threads(options.threads or physical_cores())
+        self.device = choose_device(options.device)
+        self.policy = policy.to(self.device)
+        self.batches, self.run, self.options, self.optim = batches, run, options, optim
+        self.seed, self.description = seed, dict(description)
+        self.ema = Ema(self.policy, optim.ema_decay)
+        self.optimiser = make_optimiser(self.policy, optim)
+        self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
+        self.step = self.saved_step = 0
+        self.train_s = 0.0  # spent in this and earlier processes
+        self._logger_state: dict[str, Any] | None = None
+        precision: str | None = None
+        if run.last_state.exists():
+            details = load_state(run.last_state, self.state)
+            self.step = self.saved_step = details["step"]
+            self.train_s, self._logger_state = details["train_s"], details["logger"]
+            precision = details["precision"]
+            batches.load_state_dict(details["batches"])
+            log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
+        self.precision = precision or choose_precision(options.precision, self.device)
+        self._loss = torch.compile(self.policy.loss) if options.compile else self.policy.loss
+
+    @property
+    def is_finished(self) -> bool:
+        return self.step >= self.options.steps
+
+    def train(self) -> None:
+        """Runs the remaining steps. Raises UserError on a loss or gradient that is not finite, or a full disk."""
+        if self.is_finished:
+            return
+        self.policy.train()
+        logger = MetricsLogger(self.run, self.step, self._logger_state)
+        with (
+            closing(self.batches),
+            closing(logger),
+            Progress("training", self.options.steps, done=self.step) as progress,
+        ):
+            self._loop(logger, progress)
+
+    def _loop(self, logger: MetricsLogger, progress: Progress) -> None:
+        keep_weights = self.options.checkpoint_steps()
+        start = interval_start = last_save = time.perf_counter()
+        spent_before, first_step, interval_step, waited = self.train_s, self.step, self.step, 0.0
+        while not self.is_finished:
+            before = time.perf_counter()
+            batch = next(self.batches).to(self.device)
+            waited += time.perf_counter() - before
+            scalars = self._update(batch)
+            logger.add(scalars)
+            now = time.perf_counter()
+            self.train_s = spent_before + now - start
+            rate = (self.step - first_step) / (now - start)
+            progress.advance(f"loss {scalars['loss']:.4f}  {rate:.2f} steps/s")
+            if self.step % self.options.log_every == 0 or self.is_finished:
+                seconds = now - interval_start
+                rate = (self.step - interval_step) / seconds
+                logger.write(
+                    self.step, steps_per_s=rate, data_wait_fraction=waited / seconds, train_s=self.train_s
+                )
+                interval_start, interval_step, waited = now, self.step, 0.0
+            if self.step in keep_weights:
+                self._save_weights()
+            if self.step in keep_weights or self.is_finished or now - last_save >= self.options.save_every_s:
+                self._save_state(logger)
+                last_save = time.perf_counter()
+
+    def _update(self, batch: Batch) -> dict[str, float]:
+        """One step of the optimiser; returns what to log."""
+        seed = step_seed(self.seed, self.step)
+        torch.manual_seed(seed)  # for dropout and the like, which take no generator
+        rate = learning_rate(
+            self.step,
+            steps=self.options.steps,
+            peak=self.optim.lr,
+            warmup=self.optim.warmup,
+            floor=self.optim.floor,
+        )
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        with autocast(self.precision, self.device):
+            loss, logs = self._loss(batch, torch.Generator().manual_seed(seed))
+        loss_value = loss.item()
+        self._refuse_non_finite("loss", loss_value)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm).item()
+        self._refuse_non_finite("norm of the gradient", norm)
+        self.optimiser.step()
+        self.ema.update(self.step)
+        self.step += 1
+        return {"loss": loss_value, "grad_norm": norm, "lr": rate} | {
+            key: value.item() for key, value in logs.items()
+        }
+
+    def _refuse_non_finite(self, what: str, value: float) -> None:
+        if not math.isfinite(value):
+            kept = (
+                f"the state of step {self.saved_step} is kept"
+                if self.saved_step
+                else "no state was saved before"
+            )
+            raise UserError(
+                f"Training stopped at step {self.step + 1}, batch {self.step}: the {what} is {value}; {kept} in "
+                f"{self.run.path}. Lower optim.lr or optim.clip_norm, or set training.precision=fp32."
+            )
+
+    def _save_weights(self) -> None:
+        description = {
+            "step": self.step,
+            "train_s": round(self.train_s, 1),
+            "code": code_version(),
+            **self.description,
+        }
+        save_weights(self.run.weights_directory(self.step), self.ema.policy, description)
+
+    def _save_state(self, logger: MetricsLogger) -> None:
+        details = {
+            "step": self.step,
+            "train_s": self.train_s,
+            "precision": self.precision,
+            "batches": self.batches.state_dict(),
+            "logger": logger.state(),
+            "code": code_version(),
+        }
+        save_state(self.run.last_state, self.state, details)
+        self.saved_step = self.step
+
+
+def step_seed(seed: int, step: int) -> int:
+    """Seed of all random numbers that a policy draws at `step`."""
+    return int(np.random.SeedSequence([seed, LOSS_STREAM, step]).generate_state(1, np.uint64)[0])
+
+
+def choose_device(wanted: str) -> torch.device:
+    """The device for cpu, cuda or auto. Raises UserError where CUDA is wanted and not there."""
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise UserError("training.device is cuda, but torch finds no CUDA device: set training.device=cpu.")
+    if wanted == "auto":
+        wanted = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(wanted)

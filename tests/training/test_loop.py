@@ -1,0 +1,193 @@
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from tiny_policy import TinyPolicy
+
+from imfvla.errors import UserError
+from imfvla.training.logger import read_metrics
+from imfvla.training.loop import choose_device, step_seed
+
+TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing catches it."""
+
+
+class DiesAt(TinyPolicy):
+    """Raises at the forward pass of a step (0-based), counted within the process."""
+
+    def __init__(self, calls: int, error: BaseException) -> None:
+        super().__init__()
+        self.calls, self.error = calls, error
+
+    def loss(self, batch, rng):
+        if self.calls == 0:
+            raise self.error
+        self.calls -= 1
+        return super().loss(batch, rng)
+
+
+def tensors_of(path: Path) -> dict[str, torch.Tensor]:
+    with safe_open(path, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+
+
+def details_of(path: Path) -> dict:
+    with safe_open(path, framework="pt") as file:
+        details = json.loads(file.metadata()["details"])
+    del details["train_s"]
+    return details
+
+
+def untimed_metrics(run) -> list[dict]:
+    return [
+        {key: value for key, value in row.items() if key not in TIMES} for row in read_metrics(run.metrics)
+    ]
+
+
+def assert_same_run(one, other):
+    """Weights, average, moments, counters and metrics are equal bit for bit."""
+    assert details_of(one.last_state) == details_of(other.last_state)
+    paths = [one.last_state, *(one.policy_weights(step) for step in one.weight_steps())]
+    others = [other.last_state, *(other.policy_weights(step) for step in other.weight_steps())]
+    assert len(paths) == len(others) == 3
+    for path, counterpart in zip(paths, others, strict=True):
+        tensors, expected = tensors_of(path), tensors_of(counterpart)
+        assert tensors.keys() == expected.keys()
+        assert all(torch.equal(tensors[name], expected[name]) for name in tensors)
+    assert untimed_metrics(one) == untimed_metrics(other)
+
+
+@pytest.mark.parametrize("killed_at", [1, 2, 3])
+def test_resume_equals_uninterrupted_bit_for_bit(tmp_path, make_trainer, killed_at):
+    whole = make_trainer(tmp_path / "whole")
+    whole.train()
+    with pytest.raises(Killed):
+        make_trainer(tmp_path / "resumed", DiesAt(killed_at, Killed())).train()
+    resumed = make_trainer(tmp_path / "resumed")
+    assert resumed.step == killed_at
+    resumed.train()
+    assert_same_run(whole.run, resumed.run)
+
+
+def test_resume_from_an_older_state_repeats_no_row(tmp_path, make_trainer):
+    """The state is older than the last row and the last weights: both are made again."""
+    whole = make_trainer(tmp_path / "whole", log_every=1)
+    whole.train()
+    with pytest.raises(Killed):
+        make_trainer(tmp_path / "resumed", DiesAt(3, Killed()), log_every=1, save_every_s=1e9).train()
+    resumed = make_trainer(tmp_path / "resumed", log_every=1)
+    assert resumed.step == 2  # saved with the weights of half-time
+    assert [row["step"] for row in read_metrics(resumed.run.metrics)] == [1, 2, 3]
+    resumed.train()
+    assert_same_run(whole.run, resumed.run)
+
+
+def test_resumes_after_sigkill(tmp_path, make_trainer):
+    script = textwrap.dedent(
+        """
+        import os, signal, sys
+        sys.path.insert(0, sys.argv[2])
+        from tiny_policy import CountedBatches, OPTIM, OPTIONS, TinyPolicy
+        from imfvla.run_directory import RunDirectory
+        from imfvla.training.loop import Trainer
+
+        class Dies(TinyPolicy):
+            calls = 0
+            def loss(self, batch, rng):
+                self.calls += 1
+                if self.calls == 3:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return super().loss(batch, rng)
+
+        Trainer(Dies(), CountedBatches(), RunDirectory(sys.argv[1]), OPTIONS, OPTIM, seed=7, description={}).train()
+        """
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "killed"), str(Path(__file__).parent)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    whole, resumed = make_trainer(tmp_path / "whole"), make_trainer(tmp_path / "killed")
+    assert resumed.step == 2
+    whole.train()
+    resumed.train()
+    assert_same_run(whole.run, resumed.run)
+
+
+def test_finished_run_does_nothing(tmp_path, make_trainer):
+    make_trainer(tmp_path).train()
+    trainer = make_trainer(tmp_path, DiesAt(0, Killed()))
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    assert trainer.is_finished
+    trainer.train()
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+def test_keeps_weights_at_shares_of_the_steps(tmp_path, make_trainer):
+    trainer = make_trainer(tmp_path, steps=7, checkpoints=3)
+    trainer.train()
+    assert trainer.run.weight_steps() == [2, 5, 7]
+    described = json.loads(trainer.run.policy_weights(7).with_suffix(".json").read_text())
+    assert described["step"] == 7
+    kept = tensors_of(trainer.run.policy_weights("last"))
+    assert all(torch.equal(kept[name], value) for name, value in trainer.ema.policy.state_dict().items())
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_stops_where_loss_or_gradient_is_not_finite(tmp_path, make_trainer, where):
+    class Diverges(TinyPolicy):
+        calls = 0
+
+        def loss(self, batch, rng):
+            self.calls += 1
+            loss, logs = super().loss(batch, rng)
+            if self.calls < 3:
+                return loss, logs
+            # the square root's slope at 0 is infinite: a finite loss with a gradient that is not
+            return (loss * torch.nan if where == "loss" else loss + (0 * loss).sqrt()), logs
+
+    with pytest.raises(UserError, match=r"step 3, batch 2: .* is nan; the state of step 2 is kept"):
+        make_trainer(tmp_path, Diverges()).train()
+    trainer = make_trainer(tmp_path)
+    assert trainer.step == 2
+    assert all(tensor.isfinite().all() for tensor in trainer.policy.state_dict().values())
+
+
+def test_closes_the_batches(tmp_path, make_trainer):
+    trainer = make_trainer(tmp_path, DiesAt(0, Killed()))
+    with pytest.raises(Killed):
+        trainer.train()
+    assert trainer.batches.closed
+
+
+def test_bf16_trains(tmp_path, make_trainer):
+    trainer = make_trainer(tmp_path, precision="bf16")
+    trainer.train()
+    assert details_of(trainer.run.last_state)["precision"] == "bf16"
+    assert {parameter.dtype for parameter in trainer.policy.parameters()} == {torch.float32}
+
+
+def test_metrics_have_the_documented_columns(tmp_path, make_trainer):
+    trainer = make_trainer(tmp_path)
+    trainer.train()
+    rows = read_metrics(trainer.run.metrics)
+    assert [row["step"] for row in rows] == [3, 4]
+    assert set(rows[0]) == {"step", "loss", "error", "grad_norm", "lr", *TIMES}
+    assert list(trainer.run.tensorboard.glob("events.*"))
+
+
+def test_steps_have_seeds_of_their_own():
+    assert len({step_seed(seed, step) for seed in range(3) for step in range(100)}) == 300
+
+
+def test_cuda_without_a_device_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto").type == "cpu"
+    with pytest.raises(UserError, match=r"training\.device is cuda"):
+        choose_device("cuda")
