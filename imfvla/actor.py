@@ -16,16 +16,17 @@ from imfvla.policy import Policy
 from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.types import Observation
 
-# A sound policy misses the joint limits by little and is clipped; one that misses them by this many range widths
-# has diverged, and clipping would only hide it.
+# A sound policy misses the joint limits by little and is clipped; one that misses them by this many range
+# widths has diverged, and clipping would only hide it.
 FAR = 10.0
 
 
 class ChunkActor:
     """Plays a policy in closed loop: an `episode.Actor` that replans every `horizon.exec` control steps.
 
-    Cameras are looked at only in the steps that enter a decision. The noise of replanning k in the episode `seed` is
-    drawn from `SeedSequence([noise_seed, seed, k])` alone, so every policy with equal chunks sees the same noise.
+    Cameras are looked at only in the steps that enter a decision. The noise of replanning k in the
+    episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so every policy with equal
+    chunks sees the same noise.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class ChunkActor:
         self._device = torch.device(device)
 
     def reset(self, env: Any, seed: int) -> None:
-        """Forgets the last episode. `env` has the limits of the actions, [rad] and [0, 1], and the instruction."""
+        """Forgets the last episode. `env` has the instruction and the limits of the actions [rad], [0, 1]."""
         spec = env.action_spec()
         self._minimum, self._maximum = (
             np.broadcast_to(limit, spec.shape).astype(np.float32) for limit in (spec.minimum, spec.maximum)
@@ -75,7 +76,7 @@ class ChunkActor:
     def _plan(
         self, images: list[np.ndarray], states: list[np.ndarray], replanning: int
     ) -> tuple[np.ndarray, float]:
-        """From To arrays uint8 (V, H, W, 3) and float32 (S,) to the chunk, float32 (Tp, A), and the time taken [ms]."""
+        """From To images (V, H, W, 3) and states (S,) to a chunk, float32 (Tp, A), and the time [ms]."""
         began = time.perf_counter()
         pixels = torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0)
         observation = Observation(

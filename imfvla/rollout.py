@@ -15,7 +15,7 @@ SIMULATION_ENDED = "simulation ended early"
 
 
 class ActionError(Exception):
-    """Raised by an actor without a usable action; `run_episode` ends the episode as failed with this label."""
+    """Raised by an actor without a usable action; the episode then ends, failed with this label."""
 
 
 def run_episode(
@@ -31,12 +31,13 @@ def run_episode(
 ) -> EpisodeResult:
     """Runs the episode that starts from `seed` and returns its row.
 
-    The episode lasts until the environment ends it, until `max_steps` control steps, or until `actor.done(env)`
-    where the actor has a `done` (demonstrators stop some steps after success; policies run to the end).
+    The episode lasts until the environment ends it, until `max_steps` control steps, or until
+    `actor.done(env)` where the actor has a `done` (demonstrators stop some steps after success; policies
+    run to the end).
 
-    An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row keeps
-    the reward collected so far, carries the label and counts as no success. Any other exception aborts the sinks
-    and is raised again.
+    An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row
+    keeps the reward collected so far, carries the label and counts as no success. Any other exception
+    aborts the sinks and is raised again.
 
     Args:
       env: a `BimanualEnvironment` (see `imfvla.tasks`).

@@ -1,0 +1,60 @@
+"""python -m imfvla.evaluate run=DIR episodes=100 first_seed=100000 nfe=1,2,3"""
+
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from imfvla.entry import entry_point
+from imfvla.errors import UserError
+from imfvla.options import require
+from imfvla.run_directory import RunDirectory
+
+
+@entry_point("evaluate")
+def _evaluate(config: dict[str, Any]) -> None:
+    from imfvla.evaluation import evaluate  # after the config is checked: a slip is told at once
+    from imfvla.reporting.table_row import print_row
+
+    if not config["run"]:
+        raise UserError("evaluate needs the directory of a training run: run=runs/<experiment>/<name>.")
+    for key in ("episodes", "first_seed", "noise_seed"):
+        require(_is_whole(config[key]), key, "a whole number", config[key])
+    for key in ("workers", "max_steps"):
+        require(config[key] is None or _is_whole(config[key]), key, "null or a whole number", config[key])
+    run = RunDirectory(config["run"])
+    options = {key: value for key, value in config.items() if key not in ("run", "nfe")}
+    evaluate(run, nfe=read_nfe(config["nfe"]), **options)
+    print_row(run)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command. Takes `nfe=1,2,3` as a list where Hydra would take it for a sweep."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not {"-m", "--multirun"} & set(arguments):
+        arguments = [re.sub(r"^nfe=(\d+(?:,\d+)+)$", r"nfe=[\1]", text) for text in arguments]
+    _evaluate(arguments)
+
+
+def read_nfe(value: Any) -> list[int]:
+    """Numbers of flow evaluations from a number, a list, or a text such as "1,2,3". Raises UserError."""
+    items = value.split(",") if isinstance(value, str) else value if isinstance(value, list) else [value]
+    try:
+        numbers = [item if _is_whole(item) else int(str(item)) for item in items]
+    except ValueError:
+        numbers = []
+    require(
+        bool(numbers) and min(numbers) >= 1,
+        "nfe",
+        "one or more whole numbers of at least 1, such as 1,2,3",
+        value,
+    )
+    return numbers
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+if __name__ == "__main__":
+    main()

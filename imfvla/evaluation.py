@@ -1,0 +1,151 @@
+"""Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
+
+import hashlib
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from imfvla.fingerprint import fingerprint, physical_cores
+from imfvla.options import require
+from imfvla.progress import Progress
+from imfvla.reporting.metrics import Row, summarise
+from imfvla.rollout_log import RolloutLog
+from imfvla.run_directory import RunDirectory
+from imfvla.workbench import Build, Job, finished, load_workbench, record, roll_out, worker_pool
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """What an evaluation's rows depend on, beside the code: equal protocols give equal rows but for times."""
+
+    task: str
+    variant: str
+    checkpoint_step: int
+    weights: str  # first 16 hex digits of the SHA-256 of the weights
+    nfe: int
+    noise_seed: int
+    first_seed: int
+    episodes: int
+    max_steps: int | None  # control steps of an episode, None for all of them
+
+    @property
+    def seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+    @property
+    def name(self) -> str:
+        """The folder in `rollouts/`."""
+        cut = "" if self.max_steps is None else f"_max{self.max_steps}"
+        return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{cut}"
+
+
+def evaluate(
+    run: RunDirectory,
+    *,
+    episodes: int,
+    first_seed: int,
+    nfe: Sequence[int],
+    workers: int | None = None,
+    checkpoint: int | str = "last",
+    noise_seed: int = 0,
+    max_steps: int | None = None,
+    recordings: bool = True,
+    overwrite: bool = False,
+    build: Build = load_workbench,
+) -> list[dict[str, Any]]:
+    """Rolls the policy of `run` out from the seeds `first_seed, first_seed + 1, ...`, once for each of `nfe`.
+
+    For each, writes `rollouts/<name>/` with `episodes.jsonl` (ordered by seed, equal for equal protocols
+    but for the key "timing"), `summary.json`, and, with `recordings`, MCAP and mp4 of the best, the
+    median and the worst episode. An interrupted evaluation goes on where it stopped; a finished one is
+    not repeated, unless `overwrite`.
+
+    Args:
+      workers: processes with one thread each; 0 works in this process; None takes the physical cores.
+      checkpoint: training step of the weights, or "last".
+      noise_seed: of the noise streams; equal for policies that are to be compared.
+      max_steps: control steps of an episode, None for all.
+      build: makes environment and policy, in each worker once.
+
+    Returns:
+      The summaries, in the order of `nfe`.
+
+    Raises:
+      UserError: no run, no such weights, numbers out of range, or a worker that died.
+    """
+    nfe = tuple(nfe)
+    require(episodes >= 1, "episodes", "at least 1", episodes)
+    require(first_seed >= 0, "first_seed", "at least 0", first_seed)
+    require(bool(nfe) and min(nfe) >= 1, "nfe", "one or more whole numbers of at least 1", list(nfe))
+    require(workers is None or workers >= 0, "workers", "null or at least 0", workers)
+    require(max_steps is None or max_steps >= 1, "max_steps", "null or at least 1", max_steps)
+    config = run.config()
+    weights = run.policy_weights(checkpoint)
+    step = int(weights.parent.name.removeprefix("step-"))
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
+    count = physical_cores() if workers is None else workers
+    summaries = []
+    with worker_pool(count) as pool:
+        for number in nfe:
+            protocol = Protocol(
+                task=config["task"]["name"],
+                variant=config["task"]["variant"],
+                checkpoint_step=step,
+                weights=digest,
+                nfe=number,
+                noise_seed=noise_seed,
+                first_seed=first_seed,
+                episodes=episodes,
+                max_steps=max_steps,
+            )
+            job = Job(build, run.path, step, number, noise_seed, max_steps)
+            with RolloutLog(run.rollouts(protocol.name), asdict(protocol), overwrite=overwrite) as rollouts:
+                if rollouts.summary is None:
+                    rows = _roll_out_all(job, protocol, rollouts, pool)
+                    files = _record_some(job, rows, rollouts, pool) if recordings else {}
+                    summary = {
+                        **summarise(rows),
+                        "experiment": config["name"],
+                        "nfe": number,
+                        "checkpoint_step": step,
+                        "seeds": [protocol.seeds[0], protocol.seeds[-1]],
+                        "protocol": asdict(protocol),
+                        "recordings": files,
+                        "fingerprint": fingerprint(threads=1, workers=count),
+                    }
+                    rollouts.finish(rows, summary)
+                summaries.append(rollouts.summary)
+    return summaries
+
+
+def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, pool: Executor) -> list[Row]:
+    """The rows of all seeds, ordered, those that were missing freshly made."""
+    rows = {row["seed"]: row for row in rollouts.rows}
+    missing = [seed for seed in protocol.seeds if seed not in rows]
+    with Progress(f"{protocol.task}, nfe {protocol.nfe}", protocol.episodes, done=len(rows)) as bar:
+        for row in finished([pool.submit(roll_out, job, seed) for seed in missing]):
+            rows[row["seed"]] = row
+            rollouts.append(row)
+            bar.advance(f"success {sum(r['success'] for r in rows.values())} of {len(rows)}")
+    return [rows[seed] for seed in protocol.seeds]
+
+
+def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, pool: Executor) -> dict[str, Any]:
+    """Plays the best, the median and the worst episode again into files; says which they are."""
+    chosen = best_median_worst(rows)
+    paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}
+    for _ in finished([pool.submit(record, job, row, paths[label]) for label, row in chosen.items()]):
+        pass
+    return {
+        label: {"seed": row["seed"], "return": row["total_reward"], "file": paths[label].name}
+        for label, row in chosen.items()
+    }
+
+
+def best_median_worst(rows: Sequence[Row]) -> dict[str, Row]:
+    """The rows of highest, middle and lowest return; of equal returns the lower seed counts as higher."""
+    ranked = sorted(rows, key=lambda row: (-row["total_reward"], row["seed"]))
+    chosen = {"best": ranked[0], "median": ranked[(len(ranked) - 1) // 2], "worst": ranked[-1]}
+    seen: set[int] = set()
+    return {label: row for label, row in chosen.items() if not (row["seed"] in seen or seen.add(row["seed"]))}

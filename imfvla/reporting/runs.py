@@ -1,0 +1,94 @@
+"""What run directories have to tell: the evaluations of a run, one for each number of flow evaluations."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.reporting.paper import PaperRow, paper_row
+from imfvla.run_directory import RunDirectory
+
+REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are demonstrations and selection
+METRICS = (
+    "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
+    "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
+    "inference_ms_p95", "success_interval",
+)  # fmt: skip
+DESCRIPTION = ("experiment", "nfe", "checkpoint_step", "seeds", "protocol", "fingerprint")
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """One finished evaluation of a run, and the paper's row of the same experiment where it has one."""
+
+    run: Path
+    folder: Path
+    summary: dict[str, Any]  # `summary.json`, every metric in it
+    paper: PaperRow | None
+
+    @property
+    def nfe(self) -> int:
+        return self.summary["nfe"]
+
+    @property
+    def is_reporting(self) -> bool:
+        """Whether whole episodes were rolled out from seeds of the reporting band."""
+        whole = self.summary["protocol"].get("max_steps") is None
+        return whole and self.summary["seeds"][0] >= REPORTING_FIRST_SEED
+
+
+def evaluations(run: RunDirectory) -> list[Evaluation]:
+    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary."""
+    experiment = run.config().get("name", "")
+    folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
+    return [_read(run, folder, experiment) for folder in folders]
+
+
+def rows(run: RunDirectory) -> list[Evaluation]:
+    """The evaluations that stand in tables, one for each nfe, ascending.
+
+    Of several: whole episodes of the reporting band before others, then later weights, then more episodes.
+
+    Raises:
+      UserError: the directory holds no run, no finished evaluation, or a broken summary.
+    """
+    found = evaluations(run)
+    if not found:
+        raise UserError(
+            f"{run.path} has no finished evaluation: make one with python -m imfvla.evaluate run={run.path}."
+        )
+    chosen: dict[int, Evaluation] = {}
+    for evaluation in sorted(found, key=_rank):
+        chosen[evaluation.nfe] = evaluation
+    return [chosen[nfe] for nfe in sorted(chosen)]
+
+
+def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
+    """Runs with a finished evaluation in or below the directories, by path."""
+    found = {
+        summary.parents[2]
+        for root in directories
+        for summary in Path(root).glob("**/rollouts/*/summary.json")
+    }
+    return [RunDirectory(path) for path in sorted(found) if (path / "config.yaml").exists()]
+
+
+def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:
+    summary = evaluation.summary
+    return evaluation.is_reporting, summary["checkpoint_step"], summary["episodes"]
+
+
+def _read(run: RunDirectory, folder: Path, experiment: str) -> Evaluation:
+    path = folder / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
+    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
+        raise UserError(
+            f"{path} cannot be read as JSON: {error}; evaluate again with overwrite=true."
+        ) from error
+    if missing:
+        raise UserError(f"{path} lacks {', '.join(missing)}: evaluate again with overwrite=true.")
+    return Evaluation(run.path, folder, summary, paper_row(experiment, summary["nfe"]))

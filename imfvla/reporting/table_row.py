@@ -1,0 +1,107 @@
+"""The row of a run beside the paper's printed one: for the terminal, `table_row.md` and `table_row.json`."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from rich.console import Console
+
+from imfvla.files import write_json, write_text
+from imfvla.reporting.metrics import wilson_interval
+from imfvla.reporting.paper import PaperRow
+from imfvla.reporting.runs import METRICS, Evaluation, rows
+from imfvla.reporting.table import NOTHING, Table, number
+from imfvla.run_directory import RunDirectory
+
+COLUMNS = (
+    "nfe", "source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "95% interval",
+    "Latency ms", "p95 ms", "Inf. FPS", "Control FPS",
+)  # fmt: skip
+
+
+def print_row(run: RunDirectory, console: Console | None = None) -> None:
+    """Prints the rows of a run, one for each nfe, and writes `table_row.md` and `table_row.json` beside its config.
+
+    Raises UserError where the run has no finished evaluation.
+    """
+    found = rows(run)
+    table = table_of(found)
+    write_text(run.path / "table_row.md", table.markdown())
+    write_json(run.path / "table_row.json", [as_json(evaluation) for evaluation in found])
+    table.print(console)
+
+
+def table_of(found: Sequence[Evaluation]) -> Table:
+    """Ours and the paper's rows of one run, in turn."""
+    summary, paper = found[0].summary, next((e.paper for e in found if e.paper), None)
+    where = f"Table {paper.table}" if paper else "no row in the paper"
+    cells = []
+    for evaluation in found:
+        cells.append((str(evaluation.nfe), "ours", *ours(evaluation.summary)))
+        if evaluation.paper is not None:
+            cells.append((str(evaluation.nfe), "paper", *printed(evaluation.paper)))
+    note = (
+        f"Seeds {summary['seeds'][0]} to {summary['seeds'][1]}, weights of step {summary['checkpoint_step']}, "
+        f"{summary['protocol']['task']} ({summary['protocol']['variant']}); {machine(summary)}. "
+        "Interval: Wilson, of the success share. Latency: mean over all replannings, numpy to numpy."
+    )
+    if not all(evaluation.is_reporting for evaluation in found):
+        note += " Not all rows are whole episodes of the reporting band."
+    return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), note)
+
+
+def ours(summary: dict[str, Any]) -> tuple[str, ...]:
+    """The cells of a summary, in the order of COLUMNS[2:]."""
+    episodes = summary["episodes"]
+    return (
+        number(summary["avg_return"], 2),
+        number(summary["median_return"], 1),
+        number(summary["mean_max_reward"], 2),
+        f"{summary['nonzero_episodes']}/{episodes}",
+        f"{summary['success_episodes']}/{episodes}",
+        percent(*summary["success_interval"]),
+        number(summary["inference_ms_mean"], 3),
+        number(summary["inference_ms_p95"], 3),
+        number(summary["inference_fps"], 2),
+        number(summary["control_fps"], 0),
+    )
+
+
+def printed(paper: PaperRow) -> tuple[str, ...]:
+    """The cells of a row of the paper, in the order of COLUMNS[2:]."""
+    return (
+        number(paper.avg_reward, 2),
+        number(paper.median, 1),
+        number(paper.avg_max, 2),
+        f"{paper.nonzero}/{paper.episodes}",
+        f"{paper.success}/{paper.episodes}",
+        percent(*wilson_interval(paper.success, paper.episodes)),
+        number(paper.latency_ms, 3),
+        NOTHING,
+        number(paper.inference_fps, 3),
+        NOTHING,
+    )
+
+
+def percent(low: float, high: float) -> str:
+    """A share's interval in whole and tenths of a percent."""
+    return f"{100 * low:.1f}-{100 * high:.1f}%"
+
+
+def machine(summary: dict[str, Any]) -> str:
+    """The machine of an evaluation in a few words."""
+    fingerprint = summary["fingerprint"]
+    cpu = fingerprint.get("machine", {}).get("cpu", "unknown CPU")
+    return f"{fingerprint.get('workers', 1)} worker(s) of 1 thread on {cpu}"
+
+
+def as_json(evaluation: Evaluation) -> dict[str, Any]:
+    """One row for scripts: our metrics and the paper's row, null where it has none."""
+    return {
+        "experiment": evaluation.summary["experiment"],
+        "nfe": evaluation.nfe,
+        "checkpoint_step": evaluation.summary["checkpoint_step"],
+        "seeds": evaluation.summary["seeds"],
+        "ours": {key: evaluation.summary[key] for key in METRICS},
+        "paper": asdict(evaluation.paper) if evaluation.paper else None,
+    }

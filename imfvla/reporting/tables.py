@@ -1,0 +1,99 @@
+"""Tables 1 to 3 over many runs, ours beside the paper's: Markdown and CSV."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from imfvla.files import write_text
+from imfvla.reporting.paper import TITLES, Comparison, PaperRow, comparisons, paper_rows
+from imfvla.reporting.runs import Evaluation, rows
+from imfvla.reporting.table import NOTHING, Table
+from imfvla.reporting.table_row import COLUMNS, ours, printed
+from imfvla.run_directory import RunDirectory
+
+Ours = dict[tuple[str, int], Evaluation]  # experiment and nfe -> the run that stands for it
+
+
+def collect(runs: Sequence[RunDirectory]) -> Ours:
+    """The evaluation of each experiment and nfe; of several runs, whole reporting bands first, then the last trained."""
+    found: Ours = {}
+    for run in runs:
+        for evaluation in rows(run):
+            key = (evaluation.summary["experiment"], evaluation.nfe)
+            if key not in found or _rank(evaluation) >= _rank(found[key]):
+                found[key] = evaluation
+    return found
+
+
+def tables(found: Ours) -> dict[str, Table]:
+    """File stem -> table: the paper's three, and the rows of ours that the paper does not have."""
+    named = {f"table{number}": _paper_table(number, found) for number in (1, 2)}
+    named["table3"] = _comparison_table(found)
+    others = {key: evaluation for key, evaluation in found.items() if evaluation.paper is None}
+    if others:
+        cells = tuple(
+            (experiment, str(nfe), "ours", *ours(evaluation.summary))
+            for (experiment, nfe), evaluation in sorted(others.items())
+        )
+        named["others"] = Table("Rows without a counterpart in the paper", ("Experiment", *COLUMNS), cells)
+    return named
+
+
+def write(named: dict[str, Table], directory: Path) -> list[Path]:
+    """Writes each table as Markdown and CSV; returns the paths."""
+    paths = []
+    for stem, table in named.items():
+        for suffix, text in ((".md", table.markdown()), (".csv", table.csv())):
+            write_text(directory / f"{stem}{suffix}", text)
+            paths.append(directory / f"{stem}{suffix}")
+    return paths
+
+
+def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
+    """A result of Table 3 from two rows, as the paper prints it: "1.76×" or "+15"."""
+    value, against = getattr(row, comparison.column), getattr(baseline, comparison.column)
+    return _result(comparison.operation, value, against)
+
+
+def _rank(evaluation: Evaluation) -> tuple[bool, float]:
+    return evaluation.is_reporting, (evaluation.folder / "summary.json").stat().st_mtime
+
+
+def _paper_table(number: int, found: Ours) -> Table:
+    cells = []
+    for row in paper_rows():
+        if row.table == number:
+            name = f"{row.method} ({row.setting})"
+            cells.append((name, str(row.nfe), "paper", *printed(row)))
+            if (row.experiment, row.nfe) in found:
+                summary = found[row.experiment, row.nfe].summary
+                cells.append((row.experiment, str(row.nfe), "ours", *ours(summary)))
+    note = "Our rows stand below the paper's of the same experiment; where none stands, it has not been run here."
+    return Table(TITLES[number], ("Experiment", *COLUMNS), tuple(cells), note)
+
+
+def _comparison_table(found: Ours) -> Table:
+    cells = []
+    for comparison in comparisons():
+        row = found.get((comparison.experiment, comparison.nfe))
+        baseline = found.get((comparison.baseline, comparison.baseline_nfe))
+        result = NOTHING
+        if row and baseline:
+            key = {
+                "avg_reward": "avg_return",
+                "success": "success_episodes",
+                "latency_ms": "inference_ms_mean",
+            }
+            name = key.get(comparison.column, comparison.column)
+            result = _result(comparison.operation, row.summary[name], baseline.summary[name])
+        cells.append((comparison.comparison, comparison.metric, comparison.result, result))
+    return Table(TITLES[3], ("Comparison", "Metric", "Paper", "Ours"), tuple(cells))
+
+
+def _result(operation: str, value: float | None, against: float | None) -> str:
+    if value is None or against is None:
+        return NOTHING
+    if operation == "difference":
+        return f"{value - against:+g}"
+    if operation == "inverse_ratio":
+        value, against = against, value
+    return f"{value / against:.2f}×" if against else NOTHING

@@ -1,0 +1,111 @@
+"""The files of one evaluation: rows as they come, so that a killed one goes on, and the whole at the end."""
+
+import fcntl
+import json
+import logging
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.files import clear_write_errors, write_json, write_text
+from imfvla.fingerprint import code_version
+from imfvla.reporting.metrics import Row
+
+log = logging.getLogger(__name__)
+
+PARTIAL = "episodes.partial.jsonl"  # a header with protocol and code, then rows as they came
+
+
+class RolloutLog:
+    """Holds the folder of one evaluation while it runs.
+
+    `summary` is the finished evaluation's where there is one of the same protocol, else None; `rows` are
+    those that an interrupted evaluation of the same protocol and code has left. Raises UserError where
+    another process holds the folder or a file in it cannot be read or written.
+    """
+
+    def __init__(self, path: Path, protocol: Mapping[str, Any], *, overwrite: bool = False) -> None:
+        self.path = path
+        self._protocol = dict(protocol)
+        self._overwrite = overwrite
+        self._partial = path / PARTIAL
+
+    def __enter__(self) -> "RolloutLog":
+        with clear_write_errors(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.path / ".lock", "a")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._lock.close()
+            raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.") from None
+        self._stream = None
+        self.rows: list[dict[str, Any]] = []
+        self.summary = None if self._overwrite else self._finished()
+        if self.summary is None:
+            self._open_partial()
+        return self
+
+    def append(self, row: Row) -> None:
+        """Keeps a row, at once on disk."""
+        with clear_write_errors(self._partial):
+            self._stream.write(dump_row(row))
+            self._stream.flush()
+
+    def finish(self, rows: Iterable[Row], summary: Mapping[str, Any]) -> None:
+        """Writes `episodes.jsonl` and `summary.json`, each whole or not at all, the summary last."""
+        write_text(self.path / "episodes.jsonl", "".join(dump_row(row) for row in rows))
+        write_json(self.path / "summary.json", summary)
+        self._stream.close()
+        self._stream = None
+        self._partial.unlink()
+        self.summary = dict(summary)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stream is not None:
+            self._stream.close()
+        self._lock.close()
+
+    def _finished(self) -> dict[str, Any] | None:
+        path = self.path / "summary.json"
+        if not path.exists():
+            return None
+        summary = read_json(path)
+        if summary.get("protocol") == self._protocol:
+            log.info("%s is finished already; overwrite=true repeats it.", self.path)
+            return summary
+        log.info("%s was made with another policy or protocol and is replaced.", self.path)
+        return None
+
+    def _open_partial(self) -> None:
+        header = {"protocol": self._protocol, "code": code_version()}
+        lines = []
+        if self._partial.exists() and not self._overwrite:
+            lines = self._partial.read_text(encoding="utf-8").splitlines(keepends=True)
+        if lines and not lines[-1].endswith("\n"):  # cut off by a kill
+            lines.pop()
+        if lines and json.loads(lines[0]) == header:
+            self.rows = [json.loads(line) for line in lines[1:]]
+            log.info("%s: %d episodes are there already.", self.path, len(self.rows))
+        elif lines:
+            log.info("%s belongs to another policy, protocol or code and is begun anew.", self._partial)
+        text = json.dumps(header) + "\n" + "".join(dump_row(row) for row in self.rows)
+        write_text(self._partial, text)
+        self._stream = open(self._partial, "a", encoding="utf-8")  # noqa: SIM115  closed by finish or on exit
+
+
+def dump_row(row: Row) -> str:
+    """One line of JSON, keys in their order."""
+    return json.dumps(row) + "\n"
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The content of a JSON file. Raises UserError where it is broken."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path} cannot be read as JSON: {error}; delete it and evaluate again.") from error

@@ -1,0 +1,137 @@
+"""What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from imfvla.actor import ChunkActor
+from imfvla.errors import UserError
+from imfvla.recording import McapSink, VideoSink
+from imfvla.reporting.metrics import Row, row_of, untimed
+from imfvla.rollout import run_episode
+from imfvla.run_directory import RunDirectory
+
+VIDEO_SIZE = (240, 240)  # (H, W) of a view [px]
+VIDEO_EVERY = 2  # control steps between two frames of a video: 25 frames a second
+
+Build = Callable[[Path, int], tuple[Any, Any]]  # run directory, training step -> environment, policy
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What the episodes of an evaluation have in common. Pickled, sent to the workers."""
+
+    build: Build
+    run: Path
+    step: int
+    nfe: int
+    noise_seed: int
+    max_steps: int | None
+
+
+def load_workbench(run: Path, step: int) -> tuple[Any, Any]:
+    """The environment that a run was configured for, and its policy as it was after `step` training steps."""
+    from imfvla import tasks  # here, since a GL backend is picked at import
+    from imfvla.training.checkpoint import load_policy
+
+    directory = RunDirectory(run)
+    config = directory.config()
+    env = tasks.load(
+        config["task"]["name"],
+        variant=config["task"]["variant"],
+        views=tuple(config["observation"]["views"]),
+        image_size=tuple(config["observation"]["image_size"]),
+    )
+    return env, load_policy(directory, step)
+
+
+def roll_out(job: Job, seed: int) -> dict[str, Any]:
+    """The row of the episode from `seed`."""
+    return _play(job, seed, [])
+
+
+def record(job: Job, expected: Row, path: Path) -> None:
+    """Plays an evaluated episode again, into an MCAP file and a video of the same name.
+
+    Raises RuntimeError where it does not come out as before: then the simulator, the policy or the noise
+    is not determined by the seed, and no number of the evaluation can be trusted.
+    """
+    env, _ = _bench(job.build, job.run, job.step)
+    sinks = [
+        McapSink(path, lossless=False),
+        VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), size=VIDEO_SIZE, every=VIDEO_EVERY),
+    ]
+    row = _play(job, expected["seed"], sinks)
+    before, after = untimed(expected), untimed(row)
+    if before != after:
+        raise RuntimeError(f"Seed {expected['seed']} played twice differs: {before}, then {after}.")
+
+
+def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
+    env, policy = _bench(job.build, job.run, job.step)
+    actor = ChunkActor(policy, policy.horizon, job.nfe, job.noise_seed)
+    config = RunDirectory(job.run).config() if sinks else {}
+    metadata = {"policy": str(config.get("name", "")), "nfe": job.nfe, "checkpoint_step": job.step}
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        result = run_episode(
+            env, actor, seed, sinks, kind="rollout", config=config, metadata=metadata, max_steps=job.max_steps
+        )
+    finally:
+        torch.set_num_threads(threads)
+    return row_of(result)
+
+
+@lru_cache(maxsize=1)
+def _bench(build: Build, run: Path, step: int) -> tuple[Any, Any]:
+    return build(run, step)
+
+
+@contextmanager
+def worker_pool(count: int) -> Iterator[Executor]:
+    """An executor of `count` fresh processes with one thread each; 0 does the work in this process."""
+    if count == 0:
+        yield _InThisProcess()
+        return
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"  # inherited by the workers, which read it when they load torch
+    try:
+        executor = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
+    except BrokenProcessPool as error:
+        raise UserError(
+            "A worker process died, perhaps for want of memory: choose fewer workers=... and run the same "
+            "command again; finished episodes are kept."
+        ) from error
+    finally:
+        os.environ.pop("OMP_NUM_THREADS")
+        if before is not None:
+            os.environ["OMP_NUM_THREADS"] = before
+
+
+def finished(futures: Sequence[Future]) -> Iterator[Any]:
+    """Results in the order of their completion."""
+    for future in as_completed(futures):
+        yield future.result()
+
+
+class _InThisProcess(Executor):
+    """Does the work when it is submitted."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
+        future: Future = Future()
+        future.set_result(function(*args, **kwargs))
+        return future
