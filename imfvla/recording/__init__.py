@@ -8,5 +8,15 @@ from imfvla.recording.mcap_reader import (
     read_index,
 )
 from imfvla.recording.mcap_sink import McapSink
+from imfvla.recording.video import VideoSink, write_mp4
 
-__all__ = ["Episode", "EpisodeIndex", "McapSink", "episode_is_complete", "read_episode", "read_index"]
+__all__ = [
+    "Episode",
+    "EpisodeIndex",
+    "McapSink",
+    "VideoSink",
+    "episode_is_complete",
+    "read_episode",
+    "read_index",
+    "write_mp4",
+]
