@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.func import jvp
 
 from imfvla.errors import UserError
 from imfvla.generators.base import TimeSampler, masked_error
+from imfvla.nn.forward_mode import jvp
 
 MIN_TIME = 0.02  # u = (z - D) / t: below this time the division stops
 
@@ -77,12 +77,9 @@ class ImprovedMeanFlow:
         self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
     ) -> tuple[Tensor, Tensor]:
         """u and du/dt along (v, 0, 1) in (z, r, t) (paper eq. 6), without gradient."""
-        with torch.no_grad():
-            return jvp(
-                lambda z, r, t: self.velocity(core, z, r, t, context),
-                (z, r, t),
-                (v, torch.zeros_like(r), torch.ones_like(t)),
-            )
+        return jvp(
+            lambda z, r, t: self.velocity(core, z, r, t, context), (z, r, t), (v, None, torch.ones_like(t))
+        )
 
     def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """Times r <= t (count,) of the compound loss."""

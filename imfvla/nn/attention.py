@@ -9,6 +9,9 @@ Shapes: B batch, L queries, P prefix tokens, D width, N heads, E = D / N.
 import torch
 from torch import Tensor, nn
 
+from imfvla.nn.forward_mode import product
+from imfvla.nn.linear import Linear
+
 KeyValue = tuple[Tensor, Tensor]  # keys (B, N, E, P), transposed for the product, and values (B, N, P, E)
 
 
@@ -21,8 +24,8 @@ class Attention(nn.Module):
             raise ValueError(f"width {width} is not divisible by {heads} heads")
         self.heads = heads
         self.scale = (width // heads) ** -0.5
-        self.query_key_value = nn.Linear(width, 3 * width, bias=False)
-        self.output = nn.Linear(width, width, bias=False)
+        self.query_key_value = Linear(width, 3 * width, bias=False)
+        self.output = Linear(width, width, bias=False)
 
     def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
         """Queries (B, N, L, E), scaled, and the keys and values of x (B, L, D)."""
@@ -37,8 +40,8 @@ class Attention(nn.Module):
         else:
             # One softmax over two score blocks: cheaper than concatenating the cached keys and values each time.
             num_prefix = prefix[0].shape[-1]
-            weights = torch.cat((q @ prefix[0], q @ keys), dim=-1).softmax(-1)
-            mixed = weights[..., :num_prefix] @ prefix[1] + weights[..., num_prefix:] @ values
+            weights = torch.cat((product(q, prefix[0]), q @ keys), dim=-1).softmax(-1)
+            mixed = product(weights[..., :num_prefix], prefix[1]) + weights[..., num_prefix:] @ values
         return self.output(mixed.transpose(1, 2).flatten(2))
 
     def forward(self, x: Tensor, prefix: KeyValue | None = None) -> Tensor:

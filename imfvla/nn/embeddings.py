@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from imfvla.nn.linear import Linear
+
 
 class TimeEmbedding(nn.Module):
     """A scalar in [0, 1] as a vector: sinusoids of 0.1 ... `max_rad` rad, then a two-layer MLP.
@@ -18,7 +20,7 @@ class TimeEmbedding(nn.Module):
         self.frequencies: Tensor
         frequencies = torch.exp(torch.linspace(math.log(0.1), math.log(max_rad), num_frequencies))
         self.register_buffer("frequencies", frequencies, persistent=False)
-        self.mlp = nn.Sequential(nn.Linear(2 * num_frequencies, width), nn.SiLU(), nn.Linear(width, width))
+        self.mlp = nn.Sequential(Linear(2 * num_frequencies, width), nn.SiLU(), Linear(width, width))
 
     def forward(self, time: Tensor) -> Tensor:
         angles = time.unsqueeze(-1) * self.frequencies

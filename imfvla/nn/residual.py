@@ -11,6 +11,8 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from imfvla.nn.forward_mode import product
+
 EPS = 1e-6
 
 
@@ -77,9 +79,9 @@ class AttentionResidual(nn.Module):
         return history
 
     def scores(self, increment: Tensor) -> Tensor:
-        """w_l . RMSNorm(y) for the queries of all sublayers at once: (..., D) -> (..., number of queries)."""
-        root_mean_square = (increment.square().mean(-1, keepdim=True) + EPS).rsqrt()
-        return (increment @ self.query.T) * root_mean_square
+        """w_l . RMSNorm(y) for the queries of all sublayers at once: (B, T, D) -> (B, T, number of queries)."""
+        norm = torch.linalg.vector_norm(increment, dim=-1, keepdim=True)
+        return product(increment, self.query.T) * (increment.shape[-1] ** 0.5 / (norm + EPS))
 
 
 class _Increments:
@@ -93,13 +95,13 @@ class _Increments:
         self.scores.append(self.residual.scores(increment))
 
     def weights(self, query: int) -> Tensor:
-        """a_{query, s} over the increments so far: (s, B, T), summing to 1 over s."""
-        return torch.stack([scores[..., query] for scores in self.scores]).softmax(0)
+        """a_{query, s} over the increments s so far, summing to 1: (B, T, s)."""
+        return torch.stack(self.scores, dim=-2)[..., query].contiguous().softmax(-1)
 
     def aggregate(self, query: int) -> Tensor:
         if len(self.increments) == 1:
             return self.increments[0]
-        return (self.weights(query).unsqueeze(-1) * torch.stack(self.increments)).sum(0)
+        return (self.weights(query).unsqueeze(-2) @ torch.stack(self.increments, dim=-2)).squeeze(-2)
 
     def read(self) -> Tensor:
         return self.aggregate(len(self.increments) - 1)

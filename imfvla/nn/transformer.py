@@ -3,7 +3,7 @@
 - Context, time and action tokens run through the same weights. Context tokens do not see action tokens, so that
   their keys and values are computed once per observation and serve every flow evaluation, every noise draw and the
   Jacobian-vector product.
-- Sublayers (attention, SwiGLU) have their own RMS pre-norm and read what the residual hands them.
+- Sublayers (attention, SwiGLU) have their own pre-norm and read what the residual hands them.
 - Several consecutive steps of the sequence share one token ("patch").
 - The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
 
@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from imfvla.nn.attention import Attention, KeyValue
 from imfvla.nn.embeddings import TimeEmbedding
+from imfvla.nn.linear import Linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,8 @@ class SwiGLU(nn.Module):
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
-        self.input = nn.Linear(width, 2 * hidden, bias=False)
-        self.output = nn.Linear(hidden, width, bias=False)
+        self.input = Linear(width, 2 * hidden, bias=False)
+        self.output = Linear(hidden, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         a, b = self.input(x).chunk(2, dim=-1)
@@ -61,9 +62,9 @@ class Block(nn.Module):
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attention_norm = nn.RMSNorm(width)
+        self.attention_norm = nn.LayerNorm(width, bias=False)
         self.attention = Attention(width, heads)
-        self.mlp_norm = nn.RMSNorm(width)
+        self.mlp_norm = nn.LayerNorm(width, bias=False)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
 
@@ -91,14 +92,14 @@ class TransformerCore(nn.Module):
         if steps % patch:
             raise ValueError(f"core.patch must divide the {steps} steps of horizon.pred, found {patch}")
         self.steps, self.channels, self.width, self.patch = steps, channels, width, patch
-        self.input = nn.Linear(patch * channels, width)
+        self.input = Linear(patch * channels, width)
         self.position = nn.Parameter(0.02 * torch.randn(steps // patch, width))
         self.time = TimeEmbedding(width, max_rad)
         self.interval = TimeEmbedding(width, max_rad)
         self.blocks = nn.ModuleList(Block(width, heads, mlp_ratio) for _ in range(depth))
         self.residual = residual(2 * depth, width)
-        self.norm = nn.RMSNorm(width)
-        self.output = nn.Linear(width, patch * channels)
+        self.norm = nn.LayerNorm(width, bias=False)
+        self.output = Linear(width, patch * channels)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
