@@ -15,7 +15,6 @@ import torch
 
 from imfvla.actor import ChunkActor
 from imfvla.errors import UserError
-from imfvla.recording import McapSink, VideoSink
 from imfvla.reporting.metrics import Row, row_of, untimed
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
@@ -65,6 +64,8 @@ def record(job: Job, expected: Row, path: Path) -> None:
     Raises RuntimeError where it does not come out as before: then the simulator, the policy or the noise
     is not determined by the seed, and no number of the evaluation can be trusted.
     """
+    from imfvla.recording import McapSink, VideoSink  # what writes videos is needed here alone
+
     env, _ = _bench(job.build, job.run, job.step)
     sinks = [
         McapSink(path, lossless=False),
