@@ -16,6 +16,7 @@ from imfvla.errors import UserError
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_HEIGHT, CAPTION_MARGIN = 28, 6  # [px]
+MIN_WIDTH = 480  # [px] of a row: less has no room for a legible caption
 CAPTION_SCALE = 0.5  # of the font, at most; long captions shrink until they fit
 WHITE = (255, 255, 255)
 
@@ -95,8 +96,10 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Non
 
 
 def side_by_side(pictures: Sequence[np.ndarray], caption: str) -> np.ndarray:
-    """Pictures (H, W, 3) in a row above a line of text that fits their width: uint8 (H + 28, sum of W, 3)."""
+    """Pictures uint8 (H, W, 3) in a row above a line of text that fits; small ones grow by a whole factor."""
     row = np.concatenate(pictures, axis=1)
+    factor = -(-MIN_WIDTH // row.shape[1])
+    row = row.repeat(factor, axis=0).repeat(factor, axis=1)
     line = np.zeros((CAPTION_HEIGHT, row.shape[1], 3), np.uint8)
     (width, _), _ = cv2.getTextSize(caption, FONT, CAPTION_SCALE, 1)
     scale = CAPTION_SCALE * min(1.0, (row.shape[1] - 2 * CAPTION_MARGIN) / max(width, 1))

@@ -1,0 +1,80 @@
+"""Checks recorded episodes: checksums, counts, times and pictures. Exits with 1 if any file fails.
+
+python tools/mcap_check.py runs/demos/socket            # every *.mcap below a directory
+python tools/mcap_check.py episode.mcap other.mcap
+"""
+
+import argparse
+import sys
+from collections import Counter
+from pathlib import Path
+
+from mcap.reader import SeekingReader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+
+from imfvla.errors import UserError
+from imfvla.recording import Episode, read_episode
+
+
+def check(path: Path) -> tuple[Episode, list[str]]:
+    """The episode at `path` and what is wrong with it. Raises UserError where it cannot be read at all."""
+    episode = read_episode(path)  # checksums, steps against messages, every picture decoded
+    problems = []
+    counts: Counter[int] = Counter()
+    last = 0
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+                if record.log_time < last:
+                    problems.append(f"log time {record.log_time} follows {last}")
+                last = max(last, record.log_time)
+    with path.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    if dict(summary.statistics.channel_message_counts) != dict(counts):
+        problems.append("the counts of its statistics are not those of its messages")
+    for view, pictures in episode.images.items():
+        if pictures.shape[1:3] != tuple(episode.info.image_size):
+            problems.append(f"view {view} is {pictures.shape[1:3]}, wanted {tuple(episode.info.image_size)}")
+    if lacking := set(episode.info.views) - set(episode.images):
+        problems.append(f"no frames of view {', '.join(sorted(lacking))}")
+    if len(episode.state) != episode.result.num_steps:
+        problems.append(f"{len(episode.state)} steps recorded, {episode.result.num_steps} in its result")
+    return episode, problems
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("paths", nargs="+", type=Path, help="MCAP files, or directories to search for them")
+    arguments = parser.parse_args()
+    files = [
+        file
+        for path in arguments.paths
+        for file in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])
+    ]
+    if not files:
+        print("No *.mcap found.", file=sys.stderr)
+        return 1
+    failed = 0
+    for file in files:
+        try:
+            episode, problems = check(file)
+        except UserError as error:
+            problems = [str(error)]
+        if problems:
+            failed += 1
+            print(f"FAIL  {file}: {'; '.join(problems)}")
+        else:
+            info, result = episode.info, episode.result
+            print(
+                f"ok    {file}: {info.task} {info.kind} seed {info.seed}, {result.num_steps} steps, "
+                f"{len(episode.image_steps)} x {len(episode.images)} pictures, "
+                f"max reward {result.max_reward:g}"
+            )
+    print(f"{len(files) - failed} of {len(files)} files ok")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
