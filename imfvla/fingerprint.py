@@ -27,13 +27,13 @@ PACKAGES = (
 
 
 def fingerprint(**extra: Any) -> dict[str, Any]:
-    """Machine, packages and code as JSON-able values; `extra` (GL renderer, threads, GPU) is added as it is."""
+    """Machine, packages and code as JSON-able values; `extra` (threads, GL renderer) is added."""
     return {"code": code_version(), "machine": machine(), "packages": packages(), **extra}
 
 
 @cache
 def code_version() -> dict[str, Any]:
-    """Version, commit and whether files were changed since ("dirty"); the last two are None outside a clone."""
+    """Version, commit and whether files differ from it (dirty); the last two are None outside a clone."""
     root = Path(imfvla.__file__).resolve().parents[1]
     commit = _git(root, "rev-parse", "HEAD")
     changes = _git(root, "status", "--porcelain", "--untracked-files=no") if commit else None

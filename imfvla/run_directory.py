@@ -99,8 +99,8 @@ class RunDirectory:
         differing = differences(self.config(), plain(config), ignored)
         if differing:
             raise UserError(
-                f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another name=..., "
-                "or delete that directory if it is not needed."
+                f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another "
+                "name=..., or delete that directory if it is not needed."
             )
 
     def status(self) -> dict[str, Any]:
@@ -114,7 +114,7 @@ class RunDirectory:
             raise UserError(f"{path} cannot be read as JSON: {error}; delete it and run again.") from error
 
     def write_status(self, state: str, **details: Any) -> None:
-        """state: running, done or failed; `details` such as step, error, traceback replace those of before."""
+        """state: running, done or failed; `details` (step, error, ...) replace those of before."""
         write_json(
             self.path / "status.json",
             {"state": state, "updated": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **details},

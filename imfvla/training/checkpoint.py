@@ -29,7 +29,7 @@ MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
 
 @dataclass(frozen=True, slots=True)
 class TrainState:
-    """Everything that the next step depends on. Learning rate and random numbers are functions of `step` alone."""
+    """All that the next step depends on: learning rate and random numbers are functions of the step alone."""
 
     policy: nn.Module
     averaged: nn.Module  # same structure as `policy`
@@ -37,7 +37,7 @@ class TrainState:
 
 
 def save_state(path: Path, state: TrainState, details: Mapping[str, Any]) -> None:
-    """Writes one file atomically: tensors, and `details` (JSON-able: step, logger sums, ...) in its header."""
+    """Writes one file atomically: tensors, and JSON-able `details` (step, logger sums, ...) in its header."""
     tensors = {f"policy/{name}": tensor for name, tensor in state.policy.state_dict().items()}
     tensors |= {f"averaged/{name}": tensor for name, tensor in state.averaged.state_dict().items()}
     for name, parameter in state.policy.named_parameters():
@@ -48,7 +48,7 @@ def save_state(path: Path, state: TrainState, details: Mapping[str, Any]) -> Non
 
 
 def load_state(path: Path, state: TrainState) -> dict[str, Any]:
-    """Fills `state` from a file of `save_state` and returns its details; changes nothing if it does not fit."""
+    """Fills `state` from a file of `save_state` and returns its details; a misfit changes nothing."""
     tensors, header = read_tensors(path)
     if header.get("format") != STATE_FORMAT:
         raise UserError(
@@ -80,7 +80,7 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
 
 
 def save_weights(directory: Path, policy: nn.Module, description: Mapping[str, Any]) -> None:
-    """Writes `policy.safetensors` and `policy.json` into a new `directory`, which appears whole or not at all."""
+    """Writes `policy.safetensors` and `policy.json` into `directory`, which appears whole or not at all."""
     temporary = directory.with_name(directory.name + PARTIAL)
     with clear_write_errors(directory):
         try:
@@ -109,7 +109,7 @@ def load_weights(policy: nn.Module, path: Path) -> None:
 
 
 def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
-    """The averaged policy of a run, ready to predict: statistics included, in eval mode, without gradients."""
+    """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients."""
     path = run.policy_weights(step)
     policy = build_policy(run.config(), statistics=None)
     load_weights(policy, path)

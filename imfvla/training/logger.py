@@ -55,7 +55,7 @@ class MetricsLogger:
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl, without a last line that a kill cut off. Raises UserError on broken lines."""
+    """The rows of metrics.jsonl, without a last line that a kill cut off. Raises UserError if damaged."""
     if not path.exists():
         return []
     rows = []

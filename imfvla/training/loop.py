@@ -1,7 +1,7 @@
 """The training loop: any policy with a loss, batches that are a function of their number, a run directory.
 
-Step i (0-based) takes batch i, random numbers from SeedSequence([seed, stream, i]) and the learning rate of i. So
-the state to resume from is the weights, their average and AdamW's moments, and a resumed run equals an
+Step i (0-based) takes batch i, random numbers of SeedSequence([seed, stream, i]) and the learning rate of i.
+So the state to resume from is the weights, their average and AdamW's moments, and a resumed run equals an
 uninterrupted one bit for bit (same machine, same number of threads).
 """
 
@@ -92,7 +92,7 @@ class Trainer:
         return self.step >= self.options.steps
 
     def train(self) -> None:
-        """Runs the remaining steps. Raises UserError on a loss or gradient that is not finite, or a full disk."""
+        """Runs the remaining steps. Raises UserError on a non-finite loss or gradient, and on a full disk."""
         if self.is_finished:
             return
         self.policy.train()
@@ -167,8 +167,8 @@ class Trainer:
                 else "no state was saved before"
             )
             raise UserError(
-                f"Training stopped at step {self.step + 1}, batch {self.step}: the {what} is {value}; {kept} in "
-                f"{self.run.path}. Lower optim.lr or optim.clip_norm, or set training.precision=fp32."
+                f"Training stopped at step {self.step + 1}, batch {self.step}: the {what} is {value}; {kept} "
+                f"in {self.run.path}. Lower optim.lr or optim.clip_norm, or set training.precision=fp32."
             )
 
     def _save_weights(self) -> None:

@@ -45,8 +45,8 @@ def make_optimiser(policy: nn.Module, options: OptimOptions) -> AdamW:
 def decayed_parameters(policy: nn.Module) -> set[str]:
     """Names of the parameters that weight decay applies to.
 
-    Not biases and gains (vectors), not what norms and embeddings own, not learned queries, positions and identities:
-    shrinking those changes what is looked up rather than how strongly.
+    Not biases and gains (vectors), not what norms and embeddings own, not learned queries, positions and
+    identities: shrinking those changes what is looked up rather than how strongly.
     """
     names = set()
     for prefix, module in policy.named_modules():

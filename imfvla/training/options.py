@@ -49,7 +49,7 @@ class TrainingOptions:
 
 @dataclass(frozen=True, slots=True)
 class OptimOptions:
-    """AdamW, its schedule, clipping and the average of the weights. Raises UserError on values out of range."""
+    """AdamW, its schedule, clipping, the average of the weights. Raises UserError on values out of range."""
 
     lr: float
     betas: tuple[float, float]

@@ -108,7 +108,8 @@ def test_resumes_after_sigkill(tmp_path, make_trainer):
                     os.kill(os.getpid(), signal.SIGKILL)
                 return super().loss(batch, rng)
 
-        Trainer(Dies(), CountedBatches(), RunDirectory(sys.argv[1]), OPTIONS, OPTIM, seed=7, description={}).train()
+        run = RunDirectory(sys.argv[1])
+        Trainer(Dies(), CountedBatches(), run, OPTIONS, OPTIM, seed=7, description={}).train()
         """
     )
     command = [sys.executable, "-c", script, str(tmp_path / "killed"), str(Path(__file__).parent)]

@@ -1,0 +1,102 @@
+"""An experiment from nothing to its row of the table: collect, train, evaluate. Run again, it goes on."""
+
+import logging
+import os
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from imfvla.collection import ensure_demonstrations
+from imfvla.composition import EXECUTION_KEYS
+from imfvla.errors import UserError
+from imfvla.evaluation import evaluate
+from imfvla.fingerprint import fingerprint
+from imfvla.horizon import Horizon
+from imfvla.options import build, require
+from imfvla.policy import build_policy
+from imfvla.reporting.table_row import print_row
+from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.training.data import make_loader, prepare_windows
+from imfvla.training.loop import Trainer
+from imfvla.training.options import OptimOptions, TrainingOptions
+
+INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationOptions:
+    """The protocol that ends a training run."""
+
+    episodes: int
+    first_seed: int
+    nfe: tuple[int, ...]
+    workers: int | None
+
+
+def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Does what is not done yet of the experiment in `run` and prints its row.
+
+    `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
+    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be had.
+    """
+    training = build(TrainingOptions, config["training"], "training")
+    optim = build(OptimOptions, config["optim"], "optim")
+    evaluation = build(EvaluationOptions, config["evaluation"], "evaluation")
+    build(Horizon, config["horizon"], "horizon")
+    seed = config["seed"]
+    require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
+    with run.lock():
+        run.claim(config, ignored=EXECUTION_KEYS)
+        try:
+            if training.steps in run.weight_steps():
+                log.info(f"{run.path} is trained already: all {training.steps} steps are done.")
+            else:
+                _train(config, run, training, optim)
+                run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
+            evaluate(run, **asdict(evaluation))  # of a finished evaluation it only reads the summary
+            if run.status().get("state") != DONE:
+                run.write_status(DONE)
+        except KeyboardInterrupt:
+            run.write_status(FAILED, error="interrupted; the same command goes on")
+            raise
+        except Exception as error:
+            with suppress(UserError):  # a full disk must not hide the error
+                run.write_status(FAILED, error=str(error), traceback=traceback.format_exc())
+            raise
+    print_row(run)
+
+
+def _train(
+    config: Mapping[str, Any], run: RunDirectory, training: TrainingOptions, optim: OptimOptions
+) -> None:
+    run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
+    windows = prepare_windows(config, ensure_demonstrations(config))
+    run.write_status(RUNNING, phase="training", pid=os.getpid())
+    seed = config["seed"]
+    initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
+    torch.manual_seed(int(initial[0]))
+    policy = build_policy(config, windows.statistics())
+    num_parameters = sum(parameter.numel() for parameter in policy.parameters())
+    log.info(f"{len(windows)} training items, {num_parameters / 1e6:.2f} M parameters")
+    trainer = Trainer(
+        policy,
+        make_loader(config, windows),
+        run,
+        training,
+        optim,
+        seed=seed,
+        description={
+            "name": config["name"],
+            "seed": seed,
+            "num_parameters": num_parameters,
+            "config_digest": config_digest(config, EXECUTION_KEYS),
+            "fingerprint": fingerprint(threads=torch.get_num_threads()),
+        },
+    )
+    trainer.train()

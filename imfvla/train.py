@@ -1,0 +1,17 @@
+"""python -m imfvla.train +exp=socket_ph32_exec16: collects what is missing, trains, evaluates, prints its row."""
+
+from typing import Any
+
+from imfvla.entry import entry_point, output_directory
+from imfvla.run_directory import RunDirectory
+
+
+@entry_point("train")
+def main(config: dict[str, Any]) -> None:
+    from imfvla.experiment import run_experiment  # after the config is composed: a slip is told at once
+
+    run_experiment(config, RunDirectory(output_directory()))
+
+
+if __name__ == "__main__":
+    main()

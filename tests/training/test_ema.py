@@ -1,0 +1,35 @@
+import pytest
+import torch
+from torch import nn
+
+from imfvla.training.ema import Ema, decay_at
+
+
+def test_decay_rises_to_its_limit():
+    assert decay_at(0, 0.999) == 0.1
+    assert decay_at(90, 0.999) == 0.91
+    assert decay_at(100_000, 0.999) == 0.999
+
+
+def test_average_closed_form():
+    source = nn.Linear(1, 1, bias=False)
+    nn.init.constant_(source.weight, 1.0)
+    ema = Ema(source, limit=0.5)
+    expected = 1.0
+    for step, weight in enumerate([2.0, -1.0, 4.0]):
+        nn.init.constant_(source.weight, weight)
+        ema.update(step)
+        decay = min(0.5, (1 + step) / (10 + step))
+        expected = decay * expected + (1 - decay) * weight
+    assert ema.policy.weight.item() == pytest.approx(expected)
+
+
+def test_copies_buffers_and_stands_apart():
+    source = nn.BatchNorm1d(2)
+    ema = Ema(source, limit=0.9)
+    source(torch.randn(8, 2))
+    ema.update(0)
+    assert torch.equal(ema.policy.running_mean, source.running_mean)
+    assert not ema.policy.training
+    assert not any(parameter.requires_grad for parameter in ema.policy.parameters())
+    assert ema.policy.weight.data_ptr() != source.weight.data_ptr()
