@@ -1,0 +1,289 @@
+"""What both tasks share: the composer task with its staged reward, and the environment around it."""
+
+import hashlib
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import dm_env
+import numpy as np
+from dm_control import composer, mjcf
+from dm_control.composer.observation import observable
+from dm_control.mujoco import engine
+from dm_env import specs
+
+from imfvla.episode import ACTION_DIM, ACTION_NAMES, CONTROL_HZ, STATE_DIM
+from imfvla.errors import UserError
+from imfvla.tasks.props import Prop
+from imfvla.tasks.robot import FINGER_TRAVEL, home_joints
+from imfvla.tasks.scene import CAMERAS, PHYSICS_TIMESTEP_S, Scene
+from imfvla.tasks.texts import text_for
+
+TIME_LIMIT_STEPS = 700
+START_OPENING = 0.8
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True, slots=True)
+class StartRange:
+    """Where a thing may lie at the start: x and y of its centre [m], yaw [rad]; each is drawn uniformly."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    yaw: tuple[float, float]
+
+    def draw(self, random_state: np.random.RandomState) -> tuple[float, float, float]:
+        return tuple(random_state.uniform(*limits) for limits in (self.x, self.y, self.yaw))
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A frame in the world: position (3,) [m], rotation (3, 3)."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+
+    def at(self, offset: np.ndarray) -> np.ndarray:
+        """World position (3,) of the point `offset` (3,) of this frame."""
+        return self.position + self.rotation @ offset
+
+
+@dataclass(frozen=True, slots=True)
+class _Ids:
+    """Indices into the compiled model, looked up once."""
+
+    qpos: np.ndarray  # (16,) of the joints in the order of ACTION_NAMES; a gripper's first finger
+    start: np.ndarray  # (18,) of all arm and finger joints, arms in the order of SIDES
+    grip: dict[str, int]  # side -> site
+    fingers: dict[str, tuple[int, int]]  # side -> geoms
+    body: dict[str, int]  # prop -> body
+    free: dict[str, int]  # prop -> first qpos of its free joint
+    geoms: dict[str, np.ndarray]  # prop -> bool (num_geoms,)
+    table: int
+
+
+class BimanualTask(composer.Task):
+    """Two arms, one table and some props. Subclasses place the props and say which stage holds.
+
+    Attributes for subclasses to set: `name`, `num_stages`, `ranges` (prop name -> StartRange).
+    """
+
+    name: str
+    num_stages: int
+    ranges: dict[str, StartRange]
+
+    def __init__(self, variant: str, props: dict[str, Prop]) -> None:
+        self.variant = variant
+        self.props = props
+        self._scene = Scene()
+        for prop in props.values():
+            self._scene.add_free_entity(prop)
+        self.set_timesteps(control_timestep=1 / CONTROL_HZ, physics_timestep=PHYSICS_TIMESTEP_S)
+        state = observable.Generic(self.state)
+        state.enabled = True
+        self._observables = OrderedDict(state=state)
+        self._ids: _Ids | None = None
+
+    @property
+    def root_entity(self) -> Scene:
+        return self._scene
+
+    @property
+    def task_observables(self) -> OrderedDict:
+        return self._observables
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        model = physics.model
+        joint = {
+            side: [f"{side}/joint_{i}" for i in range(1, 8)] + [f"{side}/finger_a", f"{side}/finger_b"]
+            for side in SIDES
+        }
+
+        def address(name: str) -> int:
+            return int(model.jnt_qposadr[model.name2id(name, "joint")])
+
+        body = {name: model.name2id(f"{name}/", "body") for name in self.props}
+        self._ids = _Ids(
+            qpos=np.array([address(n) for side in SIDES for n in joint[side][:8]]),
+            start=np.array([address(n) for side in SIDES for n in joint[side]]),
+            grip={side: model.name2id(f"{side}/grip", "site") for side in SIDES},
+            fingers={side: tuple(model.name2id(f"{side}/finger_{f}", "geom") for f in "ab") for side in SIDES},
+            body=body,
+            free={name: int(model.jnt_qposadr[model.body_jntadr[i]]) for name, i in body.items()},
+            geoms={name: np.asarray(model.geom_bodyid) == i for name, i in body.items()},
+            table=model.name2id("table", "geom"),
+        )
+
+    def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        arm = np.concatenate([home_joints(), [START_OPENING * FINGER_TRAVEL] * 2])
+        physics.data.qpos[self._ids.start] = np.concatenate([arm, arm])
+        physics.data.ctrl[:] = np.tile(np.concatenate([home_joints(), [START_OPENING]]), 2)
+        for name, prop in self.props.items():
+            x, y, yaw = self.ranges[name].draw(random_state)
+            at = self._ids.free[name]
+            physics.data.qpos[at : at + 7] = (
+                *(x, y, prop.rest_height),
+                *(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
+            )
+
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
+        """Joint targets [rad] and gripper openings [0, 1] in the order of ACTION_NAMES."""
+        limits = np.asarray(physics.model.actuator_ctrlrange, dtype=np.float32)
+        return specs.BoundedArray(
+            (ACTION_DIM,), np.float32, limits[:, 0], limits[:, 1], name="\t".join(ACTION_NAMES)
+        )
+
+    def get_reward(self, physics: mjcf.Physics) -> float:
+        return float(self.stage(physics))
+
+    def state(self, physics: mjcf.Physics) -> np.ndarray:
+        """float32 (16,): per arm 7 joint angles [rad] and the measured gripper opening [0, 1]."""
+        state = np.asarray(physics.data.qpos[self._ids.qpos], dtype=np.float32)
+        state[7::8] = np.clip(state[7::8] / FINGER_TRAVEL, 0, 1)
+        assert state.shape == (STATE_DIM,)
+        return state
+
+    def stage(self, physics: mjcf.Physics) -> int:
+        """The highest stage that holds now, 0 for none."""
+        raise NotImplementedError
+
+    def grip_pose(self, physics: mjcf.Physics, side: str) -> Pose:
+        """Frame between the fingertips of one arm, aligned with the world's at the start posture."""
+        site = self._ids.grip[side]
+        return Pose(
+            np.array(physics.data.site_xpos[site]), np.array(physics.data.site_xmat[site]).reshape(3, 3)
+        )
+
+    def prop_pose(self, physics: mjcf.Physics, name: str) -> Pose:
+        """Frame of a prop."""
+        body = self._ids.body[name]
+        return Pose(np.array(physics.data.xpos[body]), np.array(physics.data.xmat[body]).reshape(3, 3))
+
+    def contacts(self, physics: mjcf.Physics) -> np.ndarray:
+        """int (num_contacts, 2): pairs of touching geoms."""
+        return np.array(physics.data.ptr.contact.geom).reshape(-1, 2)
+
+    def holds(self, contacts: np.ndarray, side: str, name: str) -> bool:
+        """Whether both fingers of one arm touch the prop."""
+        other = self._partners(contacts, name)
+        return all(finger in other for finger in self._ids.fingers[side])
+
+    def touches(self, contacts: np.ndarray, side: str, name: str) -> bool:
+        """Whether any finger of one arm touches the prop."""
+        other = self._partners(contacts, name)
+        return any(finger in other for finger in self._ids.fingers[side])
+
+    def on_table(self, contacts: np.ndarray, name: str) -> bool:
+        """Whether the prop touches the table."""
+        return self._ids.table in self._partners(contacts, name)
+
+    def _partners(self, contacts: np.ndarray, name: str) -> set[int]:
+        mine = self._ids.geoms[name][contacts]
+        return set(contacts[mine[:, ::-1]].tolist())
+
+
+class BimanualEnvironment(composer.Environment):
+    """A task as a `dm_env.Environment` at 50 Hz whose cameras are rendered only when someone looks.
+
+    Actions are float32 (16,): joint targets [rad] and gripper openings [0, 1] in the order of ACTION_NAMES.
+    The reward is the highest stage that holds after the step; the last step is number 700.
+    """
+
+    time_limit_steps = TIME_LIMIT_STEPS
+    all_views = tuple(CAMERAS)
+
+    def __init__(
+        self, task: BimanualTask, *, seed: int | None, image_size: tuple[int, int], views: tuple[str, ...]
+    ) -> None:
+        _check_views(views)
+        self.views = tuple(views)
+        self.image_size = tuple(image_size)
+        self._seeds = np.random.RandomState(seed)
+        self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
+        self._start_digest = ""
+        super().__init__(
+            task=task,
+            time_limit=(TIME_LIMIT_STEPS - 0.1) / CONTROL_HZ,  # a margin for the sum of 3500 time steps
+            random_state=0,
+            recompile_mjcf_every_episode=False,
+            strip_singleton_obs_buffer_dim=True,
+        )
+        self._mjcf_never_compiled = False  # the constructor has compiled it; nothing is drawn into the model
+
+    @property
+    def name(self) -> str:
+        return self.task.name
+
+    @property
+    def variant(self) -> str:
+        return self.task.variant
+
+    @property
+    def num_stages(self) -> int:
+        return self.task.num_stages
+
+    @property
+    def success_stage(self) -> int:
+        """A maximum reward of at least this counts as a success."""
+        return self.task.num_stages
+
+    @property
+    def instruction(self) -> str:
+        return text_for(self.name)[0]
+
+    @property
+    def paraphrases(self) -> tuple[str, ...]:
+        return text_for(self.name)[1]
+
+    def reset(self, seed: int | None = None) -> dm_env.TimeStep:
+        """Starts an episode; `seed` alone draws its start state. Without one the construction seed's next is taken."""
+        if seed is None:
+            seed = int(self._seeds.randint(2**31))
+        self._random_state = np.random.RandomState(seed)
+        timestep = super().reset()
+        start = np.round(np.asarray(self.physics.data.qpos), 9) + 0.0
+        self._start_digest = hashlib.sha256(start.tobytes()).hexdigest()[:16]
+        return timestep
+
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        """Applies one action (16,) for 20 ms. UserError where it is not 16 finite numbers."""
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+            raise UserError(
+                f"An action must be {ACTION_DIM} finite numbers ({', '.join(ACTION_NAMES[:2])}, ...), "
+                f"found shape {action.shape}: {action}; check what chose it."
+            )
+        return super().step(action)
+
+    def state(self) -> np.ndarray:
+        """float32 (16,): per arm 7 joint angles [rad] and the measured gripper opening [0, 1]."""
+        return self.task.state(self.physics)
+
+    def stage(self) -> int:
+        """The highest stage that holds now, 0 for none."""
+        return self.task.stage(self.physics)
+
+    def start_digest(self) -> str:
+        """16 hex digits that name the start state of this episode."""
+        return self._start_digest
+
+    def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+        """Pictures uint8 (H, W, 3) of the named views, of the configured ones by default."""
+        return {view: self.render(view, *self.image_size) for view in (views or self.views)}
+
+    def render(self, view: str, height: int, width: int) -> np.ndarray:
+        """One view at any size: uint8 (height, width, 3)."""
+        _check_views((view,))
+        key = (view, height, width)
+        if key not in self._cameras:
+            self._cameras[key] = engine.Camera(self._physics, height, width, CAMERAS[view])
+        return self._cameras[key].render().copy()
+
+    def close(self) -> None:
+        self._cameras.clear()
+        super().close()
+
+
+def _check_views(views: tuple[str, ...]) -> None:
+    for view in views:
+        if view not in CAMERAS:
+            raise UserError(f"There is no view {view!r}; choose from {', '.join(CAMERAS)} in observation.views.")

@@ -1,0 +1,15 @@
+"""Scripted demonstrators: they read the simulator, and their recorded actions are what policies learn."""
+
+from imfvla.errors import UserError
+from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.socket import SocketExpert
+from imfvla.tasks.experts.transfer import TransferExpert
+
+_EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert}
+
+
+def make_expert(name: str, *, modes: int, noise: float) -> Expert:
+    """The expert of the task `name`; see `Expert` for `modes` and `noise` [rad]. UserError on an unknown name."""
+    if name not in _EXPERTS:
+        raise UserError(f"There is no expert for a task {name!r}; choose one of {', '.join(sorted(_EXPERTS))}.")
+    return _EXPERTS[name](modes=modes, noise=noise)

@@ -1,0 +1,64 @@
+"""Expert of the socket task: both arms pick and lift at once; the right one aligns the peg with what it measures."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from imfvla.tasks.bimanual import BimanualEnvironment, Pose
+from imfvla.tasks.experts.base import HELD_OPENING, Expert
+from imfvla.tasks.kinematics import rotation_vector
+from imfvla.tasks.socket import PEG_LENGTH, SEATED, measure_fit
+
+STANDOFF = -0.045  # depth of the tip where the peg waits for the socket
+BEFORE_MOUTH = -0.012  # depth up to which the peg may come while it is not aligned
+GOAL_DEPTH = SEATED + 0.008
+INSERTION_SPEED = 0.05  # m/s
+ALIGNED, ALIGNED_ANGLE = 0.0025, 0.04  # m, rad
+
+
+class SocketExpert(Expert):
+    task_name = "socket"
+
+    def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
+        self.meeting = np.array([0.0, 0.0, 0.18]) + rng.uniform(-1, 1, 3) * [0.015, 0.02, 0.015]
+        self.peg_offset = rng.uniform(0.0, 0.02)
+        self.tab_offset = rng.uniform(-0.008, 0.008)
+        names = ("meeting_x", "meeting_y", "meeting_z")
+        return {
+            **dict(zip(names, self.meeting.tolist(), strict=True)),
+            "peg_offset": self.peg_offset,
+            "tab_offset": self.tab_offset,
+        }
+
+    def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
+        left, right = self.hands["left"], self.hands["right"]
+        socket, peg = (self.task.prop_pose(env.physics, name) for name in ("socket", "peg"))
+        meeting = Pose(self.meeting, np.eye(3))
+
+        has_socket = left.opening < HELD_OPENING and self.task.holds(contacts, "left", "socket")
+        if has_socket:
+            goal = self.lift(socket, meeting, self.task.props["socket"].rest_height)
+            left.move(left.carry(socket, goal), 0.0, self.speed)
+        else:
+            self.pick(left, socket, np.array(self.task.props["socket"].tab_centre) + [self.tab_offset, 0, 0])
+
+        if right.opening < HELD_OPENING and self.task.holds(contacts, "right", "peg"):
+            waiting = np.linalg.norm(socket.position - meeting.position) < 0.02
+            if has_socket and waiting and np.linalg.norm(rotation_vector(socket.rotation)) < 0.12:
+                self._insert(socket, peg)
+            else:
+                goal = Pose(self.meeting + [PEG_LENGTH / 2 - STANDOFF, 0, 0], np.eye(3))
+                goal = self.lift(peg, goal, self.task.props["peg"].rest_height)
+                right.move(right.carry(peg, goal), 0.0, self.speed)
+        else:
+            self.pick(right, peg, np.array([self.peg_offset, 0, 0]))
+
+    def _insert(self, socket: Pose, peg: Pose) -> None:
+        """Goes deeper only while aligned; otherwise corrects where it is, in front of the mouth or inside."""
+        fit = measure_fit(socket, peg)
+        aligned = np.abs(fit.aside).max() < ALIGNED and fit.angle < ALIGNED_ANGLE
+        depth = GOAL_DEPTH if aligned else max(fit.depth, min(BEFORE_MOUTH, fit.depth + 0.02))
+        right = self.hands["right"]
+        goal = Pose(socket.at(np.array([PEG_LENGTH / 2 - depth, 0, 0])), socket.rotation)
+        near = fit.depth > BEFORE_MOUTH - 0.01
+        right.move(right.carry(peg, goal), 0.0, INSERTION_SPEED if near else self.speed)

@@ -1,0 +1,69 @@
+"""Expert of the transfer task: the right arm brings the bar to the meeting point, the left one takes it there."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from imfvla.tasks.bimanual import BimanualEnvironment, Pose
+from imfvla.tasks.experts.base import HELD_OPENING, Expert
+from imfvla.tasks.kinematics import about_z, rotation_vector
+
+ABOVE = 0.07  # where the left hand waits above the bar
+TAKE_SPEED = 0.12  # m/s
+
+
+class TransferExpert(Expert):
+    task_name = "transfer"
+
+    def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
+        self.meeting = np.array([0.0, 0.0, 0.16]) + rng.uniform(-1, 1, 3) * [0.015, 0.02, 0.015]
+        self.give_at = rng.uniform(0.05, 0.07)  # along the bar, from its middle to the right
+        self.take_at = rng.uniform(-0.07, -0.05)
+        names = ("meeting_x", "meeting_y", "meeting_z")
+        return {
+            **dict(zip(names, self.meeting.tolist(), strict=True)),
+            "give_at": self.give_at,
+            "take_at": self.take_at,
+        }
+
+    def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
+        left, right = self.hands["left"], self.hands["right"]
+        bar = self.task.prop_pose(env.physics, "bar")
+        if abs(rotation_vector(bar.rotation)[2]) > np.pi / 2:  # half a turn changes nothing about a symmetric bar
+            bar = Pose(bar.position, bar.rotation @ about_z(np.pi))
+        meeting = Pose(self.meeting, np.eye(3))
+        rest_height = self.task.props["bar"].rest_height
+        raised = bar.position[2] > rest_height + 0.05
+        left_has, right_has = (
+            hand.opening < HELD_OPENING and self.task.holds(contacts, hand.side, "bar") for hand in (left, right)
+        )
+        offered = (
+            raised
+            and np.linalg.norm(bar.position - meeting.position) < 0.015
+            and np.linalg.norm(rotation_vector(bar.rotation)) < 0.1
+        )
+        take = Pose(bar.at(np.array([self.take_at, 0, 0])), bar.rotation @ about_z(self.turn["left"] * np.pi / 2))
+
+        if right_has and not left_has:
+            goal = self.lift(bar, meeting, rest_height)
+            right.move(right.carry(bar, goal), 0.0, self.speed)
+        elif left_has and raised:
+            free = right.opening > 0.6
+            retreat = right.pose.position + np.array([0.04, 0, 0.08])
+            goal = Pose(retreat if free else right.pose.position, right.pose.rotation)
+            right.move(goal, 1.0, self.speed)
+        else:
+            self.pick(right, bar, np.array([self.give_at, 0, 0]))
+
+        if left_has and raised:
+            left.move(left.carry(bar, meeting), 0.0, self.speed)
+        elif offered and right_has:
+            aside = np.linalg.norm((take.position - left.pose.position)[:2])
+            turn = np.linalg.norm(rotation_vector(take.rotation @ left.pose.rotation.T))
+            away = np.clip(max(aside / 0.02, turn / 0.25) - 0.3, 0, 1)
+            goal = Pose(take.position + [0, 0, ABOVE * away], take.rotation)
+            ready = left.is_at(take, 0.008, 0.08) or (left.opening < 0.6 and left.is_at(take, 0.02, 0.3))
+            left.move(goal, 0.0 if ready else 1.0, TAKE_SPEED)
+        else:
+            rotation = about_z(self.turn["left"] * np.pi / 2)
+            left.move(Pose(self.meeting + [self.take_at, 0, ABOVE], rotation), 1.0, self.speed)

@@ -1,0 +1,89 @@
+"""The things that are handled: a square bar and a square ring on a tab. Lengths in m, densities in kg / m^3."""
+
+from dm_control import composer, mjcf
+
+from imfvla.tasks.robot import HAND_BITS, OBJECT_BIT, TABLE_BIT
+
+BAR_WIDTH = 0.024
+RING_OUTSIDE = 0.068
+RING_THICKNESS = 0.024
+TAB_LENGTH = 0.07
+TAB_WIDTH = 0.024
+TAB_HEIGHT = 0.022
+
+ORANGE = (0.95, 0.45, 0.05, 1.0)
+YELLOW = (0.98, 0.90, 0.10, 1.0)
+BLUE = (0.10, 0.25, 0.90, 1.0)
+MAGENTA = (0.90, 0.10, 0.65, 1.0)
+
+_SOLID = {
+    "type": "box",
+    "contype": OBJECT_BIT,
+    "conaffinity": TABLE_BIT + OBJECT_BIT + sum(HAND_BITS.values()),
+    "friction": [0.3, 0.01, 0.0005],  # in the hole; the larger friction of table or finger replaces it
+    "condim": 3,  # a finger asks for 4 and gets it
+    "solref": [0.01, 1],
+    "solimp": [0.95, 0.99, 0.001],
+    "density": 900,
+}
+
+
+class Prop(composer.Entity):
+    """A rigid thing whose frame lies at the centre of what the task aligns; `rest_height` is its z on the table."""
+
+    rest_height: float
+
+    def _build(self, name: str) -> None:
+        self._root = mjcf.RootElement(model=name)
+        self._root.default.geom.group = 0
+
+    def _box(self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
+        self._root.worldbody.add("geom", name=name, pos=pos, size=half, rgba=rgba, **_SOLID)
+
+    def _paint(self, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
+        self._root.worldbody.add(
+            "geom", type="box", pos=pos, size=half, rgba=rgba, contype=0, conaffinity=0, mass=0
+        )  # fmt: skip
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        return self._root
+
+
+class Bar(Prop):
+    """A square bar along x. Both ends carry the same cap, so that half a turn changes nothing one could see."""
+
+    def _build(self, name: str, length: float, cap: float = 0.02) -> None:
+        super()._build(name)
+        self.length = length
+        self.rest_height = BAR_WIDTH / 2
+        half = BAR_WIDTH / 2
+        self._box("bar", (0, 0, 0), (length / 2, half, half), ORANGE)
+        for sign in (-1, 1):
+            skin = half + 3e-4
+            self._paint((sign * (length - cap) / 2, 0, 0), (cap / 2 + 2e-4, skin, skin), YELLOW)
+
+
+class Socket(Prop):
+    """A square ring, its aperture along x with the mouth at +x, standing on a tab that reaches to -x.
+
+    The frame lies in the middle of the mouth, so that a peg's depth is minus the x of its tip.
+    """
+
+    def _build(self, name: str, aperture: float) -> None:
+        super()._build(name)
+        self.aperture = aperture
+        self.rest_height = RING_OUTSIDE / 2
+        half, wall = RING_OUTSIDE / 2, (RING_OUTSIDE - aperture) / 4
+        middle, depth = (aperture / 2 + wall), RING_THICKNESS / 2
+        for side, sign in (("bottom", -1), ("top", 1)):
+            self._box(side, (-depth, 0, sign * middle), (depth, half, wall), BLUE)
+        for side, sign in (("near", -1), ("far", 1)):
+            self._box(side, (-depth, sign * middle, 0), (depth, wall, aperture / 2), BLUE)
+        tab = (-RING_THICKNESS - TAB_LENGTH / 2, 0, TAB_HEIGHT / 2 - half)
+        self._box("tab", tab, (TAB_LENGTH / 2, TAB_WIDTH / 2, TAB_HEIGHT / 2), BLUE)
+        rim = 0.004
+        for sign in (-1, 1):
+            self._paint((0, 0, sign * (aperture / 2 + rim)), (4e-4, aperture / 2 + 2 * rim, rim), MAGENTA)
+            self._paint((0, sign * (aperture / 2 + rim), 0), (4e-4, rim, aperture / 2), MAGENTA)
+        self.tab_centre = tab

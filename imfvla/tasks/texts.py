@@ -1,0 +1,33 @@
+"""What each task is asked for in words: one canonical sentence and its paraphrases."""
+
+from imfvla.errors import UserError
+
+TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "socket": (
+        "insert the peg into the socket",
+        (
+            "put the peg into the socket",
+            "push the orange bar through the blue socket",
+            "pick up peg and socket and plug them together",
+            "plug the bar into the ring",
+            "join the peg and the socket in the air",
+        ),
+    ),
+    "transfer": (
+        "hand the bar over to the left arm",
+        (
+            "pass the bar from the right gripper to the left gripper",
+            "give the orange bar to the left arm",
+            "transfer the bar to the other hand",
+            "pick up the bar with the right arm and hand it to the left",
+            "let the left gripper take over the bar",
+        ),
+    ),
+}
+
+
+def text_for(name: str) -> tuple[str, tuple[str, ...]]:
+    """The canonical instruction of the task `name` and its paraphrases. UserError on an unknown name."""
+    if name not in TEXTS:
+        raise UserError(f"There is no task {name!r}; choose one of {', '.join(sorted(TEXTS))}.")
+    return TEXTS[name]

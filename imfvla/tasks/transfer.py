@@ -1,0 +1,38 @@
+"""Object transfer: the right arm lifts a bar and hands it over to the left arm in the air."""
+
+from dm_control import mjcf
+
+from imfvla.tasks.bimanual import BimanualTask, StartRange
+from imfvla.tasks.props import Bar
+
+BAR_LENGTH = 0.22
+RANGES = {
+    "easy": (StartRange((0.14, 0.18), (-0.02, 0.02), (-0.1, 0.1))),
+    "default": (StartRange((0.04, 0.24), (-0.125, 0.125), (-0.55, 0.55))),
+    "hard": (StartRange((0.02, 0.26), (-0.15, 0.15), (-0.75, 0.75))),
+}
+LIFTED = 0.03  # above the resting height
+
+
+class TransferTask(BimanualTask):
+    """Stages: 1 the right gripper holds the bar, 2 lifted, 3 the left one holds it too, 4 the left one alone, in the air."""
+
+    name = "transfer"
+    num_stages = 4
+
+    def __init__(self, variant: str) -> None:
+        super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH)})
+        self.ranges = {"bar": RANGES[variant]}
+
+    def stage(self, physics: mjcf.Physics) -> int:
+        contacts = self.contacts(physics)
+        left, right = (self.holds(contacts, side, "bar") for side in ("left", "right"))
+        height = self.prop_pose(physics, "bar").position[2] - self.props["bar"].rest_height
+        lifted = height > LIFTED and not self.on_table(contacts, "bar")
+        if left and lifted:
+            if not self.touches(contacts, "right", "bar"):
+                return 4
+            return 3 if right else 0
+        if right:
+            return 2 if lifted else 1
+        return 0
