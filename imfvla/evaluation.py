@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ from imfvla.progress import Progress
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory
-from imfvla.workbench import Build, Job, finished, load_workbench, record, roll_out, worker_pool
+from imfvla.workbench import Build, Job, RunAll, load_workbench, record, roll_out, worker_pool
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +85,7 @@ def evaluate(
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     count = physical_cores() if workers is None else workers
     summaries = []
-    with worker_pool(count) as pool:
+    with worker_pool(count) as run_all:
         for number in nfe:
             protocol = Protocol(
                 task=config["task"]["name"],
@@ -102,8 +101,8 @@ def evaluate(
             job = Job(build, run.path, step, number, noise_seed, max_steps)
             with RolloutLog(run.rollouts(protocol.name), asdict(protocol), overwrite=overwrite) as rollouts:
                 if rollouts.summary is None:
-                    rows = _roll_out_all(job, protocol, rollouts, pool)
-                    files = _record_some(job, rows, rollouts, pool) if recordings else {}
+                    rows = _roll_out_all(job, protocol, rollouts, run_all)
+                    files = _record_some(job, rows, rollouts, run_all) if recordings else {}
                     summary = {
                         **summarise(rows),
                         "experiment": config["name"],
@@ -119,23 +118,23 @@ def evaluate(
     return summaries
 
 
-def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, pool: Executor) -> list[Row]:
+def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: RunAll) -> list[Row]:
     """The rows of all seeds, ordered, those that were missing freshly made."""
     rows = {row["seed"]: row for row in rollouts.rows}
     missing = [seed for seed in protocol.seeds if seed not in rows]
     with Progress(f"{protocol.task}, nfe {protocol.nfe}", protocol.episodes, done=len(rows)) as bar:
-        for row in finished([pool.submit(roll_out, job, seed) for seed in missing]):
+        for row in run_all(roll_out, [(job, seed) for seed in missing]):
             rows[row["seed"]] = row
             rollouts.append(row)
             bar.advance(f"success {sum(r['success'] for r in rows.values())} of {len(rows)}")
     return [rows[seed] for seed in protocol.seeds]
 
 
-def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, pool: Executor) -> dict[str, Any]:
+def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: RunAll) -> dict[str, Any]:
     """Plays the best, the median and the worst episode again into files; says which they are."""
     chosen = best_median_worst(rows)
     paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}
-    for _ in finished([pool.submit(record, job, row, paths[label]) for label, row in chosen.items()]):
+    for _ in run_all(record, [(job, row, paths[label]) for label, row in chosen.items()]):
         pass
     return {
         label: {"seed": row["seed"], "return": row["total_reward"], "file": paths[label].name}

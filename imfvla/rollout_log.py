@@ -84,7 +84,7 @@ class RolloutLog:
     def _open_partial(self) -> None:
         header = {"protocol": self._protocol, "code": code_version()}
         lines = []
-        if self._partial.exists() and not self._overwrite:
+        if self._partial.exists():
             lines = self._partial.read_text(encoding="utf-8").splitlines(keepends=True)
         if lines and not lines[-1].endswith("\n"):  # cut off by a kill
             lines.pop()

@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +23,7 @@ VIDEO_SIZE = (240, 240)  # (H, W) of a view [px]
 VIDEO_EVERY = 2  # control steps between two frames of a video: 25 frames a second
 
 Build = Callable[[Path, int], tuple[Any, Any]]  # run directory, training step -> environment, policy
+RunAll = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,40 +100,32 @@ def _bench(build: Build, run: Path, step: int) -> tuple[Any, Any]:
 
 
 @contextmanager
-def worker_pool(count: int) -> Iterator[Executor]:
-    """An executor of `count` fresh processes with one thread each; 0 does the work in this process."""
+def worker_pool(count: int) -> Iterator[RunAll]:
+    """Yields `run_all(function, calls)`: results of `function(*arguments)` for each call, as they complete.
+
+    The work is done in `count` fresh processes with one thread each, or in this one for 0.
+    Raises UserError where a worker dies.
+    """
     if count == 0:
-        yield _InThisProcess()
+        yield lambda function, calls: (function(*arguments) for arguments in calls)
         return
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"  # inherited by the workers, which read it when they load torch
+    executor = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+
+    def run_all(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        for future in as_completed([executor.submit(function, *arguments) for arguments in calls]):
+            yield future.result()
+
     try:
-        executor = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
-        try:
-            yield executor
-        finally:
-            executor.shutdown(cancel_futures=True)
+        yield run_all
     except BrokenProcessPool as error:
         raise UserError(
             "A worker process died, perhaps for want of memory: choose fewer workers=... and run the same "
             "command again; finished episodes are kept."
         ) from error
     finally:
+        executor.shutdown(cancel_futures=True)
         os.environ.pop("OMP_NUM_THREADS")
         if before is not None:
             os.environ["OMP_NUM_THREADS"] = before
-
-
-def finished(futures: Sequence[Future]) -> Iterator[Any]:
-    """Results in the order of their completion."""
-    for future in as_completed(futures):
-        yield future.result()
-
-
-class _InThisProcess(Executor):
-    """Does the work when it is submitted."""
-
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        future: Future = Future()
-        future.set_result(function(*args, **kwargs))
-        return future

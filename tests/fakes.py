@@ -1,4 +1,4 @@
-"""An environment and policies whose every answer is known, so that rollouts are tested without simulator and training."""
+"""An environment and a policy whose every answer is known: rollouts without simulator and training."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,6 +66,9 @@ class FakeEnvironment(StillScene):
         for frame in frames.values():
             frame[0, 0, 0], frame[0, 1, 0] = divmod(self._step, 256)
         return frames
+
+    def render(self, view: str, height: int, width: int) -> np.ndarray:
+        return np.full((height, width, 3), self._step % 256, np.uint8)
 
 
 @dataclass

@@ -32,7 +32,9 @@ def test_known_actions_pass_through_policy_and_actor(horizon: Horizon, num_steps
     env, result = play(policy, num_steps=num_steps)
     np.testing.assert_array_equal(env.executed, actions)
     decisions = range(0, num_steps, horizon.exec)
-    assert [list(steps) for steps in policy.seen] == [list(horizon.observed_steps(step)) for step in decisions]
+    assert [list(steps) for steps in policy.seen] == [
+        list(horizon.observed_steps(step)) for step in decisions
+    ]
     assert set(env.looked) >= {step for steps in policy.seen for step in steps}
     assert len(env.looked) == len(set(env.looked)) == sum(map(horizon.is_observed, range(num_steps)))
     assert len(result.inference_ms) == len(decisions)
@@ -45,6 +47,7 @@ def test_the_executed_action_is_the_entry_of_the_newest_chunk():
     actor = ChunkActor(policy, policy.horizon, nfe=1, noise_seed=0)
     env.reset(seed=1)
     actor.reset(env, 1)
+    chunk = None
     for step in range(30):
         decision = actor.act(env, env.state(), step)
         assert (decision.chunk is None) == (decision.images is None) == (step % 3 != 0)
@@ -82,7 +85,7 @@ def test_actions_are_clipped_to_the_limits():
 def test_a_chunk_that_cannot_be_executed_ends_the_episode_with_a_label(value, label):
     actions = known_actions(30)
     actions[10, 3] = value
-    env, result = play(KnownPolicy(Horizon(1, 8, 4), actions))
+    _, result = play(KnownPolicy(Horizon(1, 8, 4), actions))
     assert (result.failure, result.num_steps, result.success) == (label, 8, False)
 
 

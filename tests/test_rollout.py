@@ -15,9 +15,10 @@ from imfvla.rollout import NON_FINITE, SIMULATION_ENDED, ActionError, run_episod
 class ScriptedActor:
     """Plays the known actions; `act_at` answers instead at single steps."""
 
-    style = {"speed": 1.0}
-
-    def __init__(self, act_at: dict[int, Callable[[], Decision]] | None = None, done_at: int | None = None) -> None:
+    def __init__(
+        self, act_at: dict[int, Callable[[], Decision]] | None = None, done_at: int | None = None
+    ) -> None:
+        self.style = {"speed": 1.0}
         self._act_at, self._actions, self._done_at = act_at or {}, known_actions(40), done_at
 
     def reset(self, env: FakeEnvironment, seed: int) -> None:
@@ -61,14 +62,20 @@ class Recorder:
         self.events.append("abort")
 
 
-def play(actor: ScriptedActor, *, seed: int = 3, env: FakeEnvironment | None = None, sinks=(), **options) -> EpisodeResult:
+def play(
+    actor: ScriptedActor, *, seed: int = 3, env: FakeEnvironment | None = None, sinks=(), **options
+) -> EpisodeResult:
     return run_episode(env or FakeEnvironment(), actor, seed, sinks, kind="rollout", config={}, **options)
 
 
 def test_the_row_of_a_whole_episode():
     result = play(ScriptedActor())
     assert (result.num_steps, result.failure, result.success) == (40, None, True)
-    assert result.first_step_of_stage == (7, 15, 23)  # the stage after the step; it is 1 once 8 steps are done
+    assert result.first_step_of_stage == (
+        7,
+        15,
+        23,
+    )  # the stage after the step; it is 1 once 8 steps are done
     assert result.total_reward == 8 * (1 + 2) + 3 * 17
     assert result.max_reward == 3
     assert result.inference_ms == (2.0, 2.0, 2.0, 2.0)
@@ -113,7 +120,12 @@ def test_an_actor_may_label_the_end_itself():
         raise ActionError("no plan")
 
     result = play(ScriptedActor({0: refuse}))
-    assert (result.failure, result.num_steps, result.total_reward, result.max_reward) == ("no plan", 0, 0.0, 0.0)
+    assert (result.failure, result.num_steps, result.total_reward, result.max_reward) == (
+        "no plan",
+        0,
+        0.0,
+        0.0,
+    )
 
 
 def test_a_simulation_that_ends_before_its_time_is_a_failure():
