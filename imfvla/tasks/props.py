@@ -1,5 +1,6 @@
 """The things that are handled: a square bar and a square ring on a tab. Lengths in m, densities in kg / m^3."""
 
+import numpy as np
 from dm_control import composer, mjcf
 
 from imfvla.tasks.robot import HAND_BITS, OBJECT_BIT, TABLE_BIT
@@ -7,6 +8,7 @@ from imfvla.tasks.robot import HAND_BITS, OBJECT_BIT, TABLE_BIT
 BAR_WIDTH = 0.024
 RING_OUTSIDE = 0.068
 RING_THICKNESS = 0.024
+FLARE = 0.011  # length of the lips that guide a peg into the mouth
 TAB_LENGTH = 0.07
 TAB_WIDTH = 0.024
 TAB_HEIGHT = 0.022
@@ -35,10 +37,10 @@ class Prop(composer.Entity):
 
     def _build(self, name: str) -> None:
         self._root = mjcf.RootElement(model=name)
-        self._root.default.geom.group = 0
+        self._root.compiler.angle = "radian"
 
-    def _box(self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
-        self._root.worldbody.add("geom", name=name, pos=pos, size=half, rgba=rgba, **_SOLID)
+    def _box(self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...], **more) -> None:
+        self._root.worldbody.add("geom", name=name, pos=pos, size=half, rgba=rgba, **_SOLID, **more)
 
     def _paint(self, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
         self._root.worldbody.add(
@@ -82,8 +84,11 @@ class Socket(Prop):
             self._box(side, (-depth, sign * middle, 0), (depth, wall, aperture / 2), BLUE)
         tab = (-RING_THICKNESS - TAB_LENGTH / 2, 0, TAB_HEIGHT / 2 - half)
         self._box("tab", tab, (TAB_LENGTH / 2, TAB_WIDTH / 2, TAB_HEIGHT / 2), BLUE)
-        rim = 0.004
-        for sign in (-1, 1):
-            self._paint((0, 0, sign * (aperture / 2 + rim)), (4e-4, aperture / 2 + 2 * rim, rim), MAGENTA)
-            self._paint((0, sign * (aperture / 2 + rim), 0), (4e-4, rim, aperture / 2), MAGENTA)
+        reach, thickness = FLARE / np.sqrt(2), 0.0015
+        width = aperture / 2 + reach / 2
+        for side, turn in (("above", (0, -1)), ("below", (0, 1)), ("left", (1, 0)), ("right", (-1, 0))):
+            out = np.array([0, turn[0], -turn[1]])  # the lip leans 45 degrees to this side
+            pos = out * (aperture / 2) + reach / 2 * (out + [1, 0, 0]) + thickness / np.sqrt(2) * (out - [1, 0, 0])
+            half = (FLARE / 2, thickness, width) if turn[0] else (FLARE / 2, width, thickness)
+            self._box(f"lip_{side}", pos, half, MAGENTA, euler=(0, turn[1] * np.pi / 4, turn[0] * np.pi / 4))
         self.tab_centre = tab

@@ -14,7 +14,7 @@ UPPER_ARM = 0.34
 FOREARM = 0.34
 HAND = 0.20  # wrist centre to the point between the fingertips
 FINGER_TRAVEL = 0.045  # of each finger; the opening is twice that
-FINGER_LENGTH = 0.07
+FINGER_LENGTH = 0.08
 FINGERTIP = 0.006  # how far the fingers reach beyond the grip point
 JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
 STIFFNESS = (4000.0, 4000.0, 2500.0, 2500.0, 800.0, 800.0, 400.0)  # [N m / rad]
@@ -26,6 +26,7 @@ HOME_REACH, HOME_HEIGHT = 0.26, 0.25  # of the point between the fingertips, fro
 
 _LIGHT = {"left": (0.35, 0.38, 0.45, 1.0), "right": (0.75, 0.76, 0.78, 1.0)}
 _DARK = (0.18, 0.18, 0.20, 1.0)
+_FINGER = (0.10, 0.55, 0.50, 1.0)
 
 
 def home_joints() -> np.ndarray:
@@ -114,7 +115,7 @@ class Arm(composer.Entity):
         In this link's frame the hand points along +z and, with the hand down, away from the base is -x.
         """
         side = 1 if self.side == "right" else -1
-        position, target = np.array([-0.06, -0.115 * side, 0.03]), np.array([-0.045, 0.0, HAND])
+        position, target = np.array([-0.065, -0.115 * side, 0.03]), np.array([-0.05, 0.0, HAND + 0.015])
         link.add(
             "camera",
             name="wrist",
@@ -136,7 +137,7 @@ class Arm(composer.Entity):
         tip = HAND - 0.05  # in this body's frame
         palm = tip + FINGERTIP - FINGER_LENGTH
         hand.add(
-            "geom", name="palm", type="box", size=[0.058, 0.02, 0.02], pos=[0, 0, palm - 0.02], rgba=_DARK, mass=0.4,
+            "geom", name="palm", type="box", size=[0.058, 0.017, 0.014], pos=[0, 0, palm - 0.014], rgba=_DARK, mass=0.4,
             **solid,
         )  # fmt: skip
         quat = [0, 0, 1, 0] if self.side == "left" else [0, 1, 0, 0]  # world-aligned at home, for both arms
@@ -152,7 +153,7 @@ class Arm(composer.Entity):
             )  # fmt: skip
             finger.add(
                 "geom", name=f"finger_{name}", type="box", size=[0.006, 0.011, FINGER_LENGTH / 2],
-                pos=[0, 0, -FINGER_LENGTH / 2], rgba=_DARK, mass=0.05, **solid,
+                pos=[0, 0, -FINGER_LENGTH / 2], rgba=_FINGER, mass=0.05, **solid,
             )  # fmt: skip
         tendon = self._root.tendon.add("fixed", name="opening")
         for joint in joints:

@@ -39,7 +39,7 @@ class Scene(composer.Arena):
             solref=[0.01, 1],
         )
         for name, position, target, fovy in (
-            ("front", (0.0, -0.72, 0.50), (0.0, 0.0, 0.06), 48),
+            ("front", (0.0, -0.74, 0.52), (0.0, 0.0, 0.10), 45),
             ("top", (0.0, 0.0, 0.95), (0.0, 0.0, 0.0), 42),
         ):
             up = np.array([0, 1.0, 0]) if name == "top" else np.array([0, 0, 1.0])

@@ -16,7 +16,7 @@ from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, BimanualTask, Pose
 from imfvla.tasks.kinematics import ArmKinematics, about_z, rotation_matrix, rotation_vector
 
 CARROT_S = 0.055  # the arms' lag and half a control step: how far ahead of the hand its command lies
-SPEED, TURN_SPEED = 0.15, 2.2  # m/s, rad/s
+SPEED, TURN_SPEED = 0.125, 2.0  # m/s, rad/s
 GRASP_HEIGHT = 0.014  # of the point between the fingertips above the table
 HELD_OPENING = 0.33  # a gripper around a bar measures 0.27
 NOISE_CORRELATION = 0.9  # of the action noise from one control step to the next
@@ -36,13 +36,16 @@ class Hand:
         self.pose: Pose = None  # measured
         self.joints: np.ndarray = None  # measured (7,)
         self.opening = 1.0  # measured
+        self.closed = False  # the fingers are together as far as a bar lets them and have come to rest
         self.command = np.zeros(8)
         self.freedom = 1.0  # how much noise the present movement bears, in [LEAST_FREEDOM, 1]
 
     def measure(self, env: BimanualEnvironment, state: np.ndarray) -> None:
         self.pose = self._task.grip_pose(env.physics, self.side)
         self.joints = np.array(state[_ARM[self.side]], dtype=np.float64)
-        self.opening = float(state[_GRIPPER[self.side]])
+        opening = float(state[_GRIPPER[self.side]])
+        self.closed = opening < HELD_OPENING and abs(opening - self.opening) < 0.01
+        self.opening = opening
 
     def move(self, goal: Pose, opening: float, speed: float, turn_speed: float = TURN_SPEED) -> None:
         """Commands a step towards `goal` [speeds in m/s, rad/s] and a gripper opening [0, 1]."""

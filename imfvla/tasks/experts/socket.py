@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from imfvla.tasks.bimanual import BimanualEnvironment, Pose
-from imfvla.tasks.experts.base import HELD_OPENING, Expert
+from imfvla.tasks.experts.base import Expert
 from imfvla.tasks.kinematics import rotation_vector
 from imfvla.tasks.socket import PEG_LENGTH, SEATED, measure_fit
 
@@ -35,14 +35,14 @@ class SocketExpert(Expert):
         socket, peg = (self.task.prop_pose(env.physics, name) for name in ("socket", "peg"))
         meeting = Pose(self.meeting, np.eye(3))
 
-        has_socket = left.opening < HELD_OPENING and self.task.holds(contacts, "left", "socket")
+        has_socket = left.closed and self.task.holds(contacts, "left", "socket")
         if has_socket:
             goal = self.lift(socket, meeting, self.task.props["socket"].rest_height)
             left.move(left.carry(socket, goal), 0.0, self.speed)
         else:
             self.pick(left, socket, np.array(self.task.props["socket"].tab_centre) + [self.tab_offset, 0, 0])
 
-        if right.opening < HELD_OPENING and self.task.holds(contacts, "right", "peg"):
+        if right.closed and self.task.holds(contacts, "right", "peg"):
             waiting = np.linalg.norm(socket.position - meeting.position) < 0.02
             if has_socket and waiting and np.linalg.norm(rotation_vector(socket.rotation)) < 0.12:
                 self._insert(socket, peg)

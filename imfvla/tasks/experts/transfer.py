@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from imfvla.tasks.bimanual import BimanualEnvironment, Pose
-from imfvla.tasks.experts.base import HELD_OPENING, Expert
+from imfvla.tasks.experts.base import Expert
 from imfvla.tasks.kinematics import about_z, rotation_vector
 
 ABOVE = 0.07  # where the left hand waits above the bar
@@ -35,7 +35,7 @@ class TransferExpert(Expert):
         rest_height = self.task.props["bar"].rest_height
         raised = bar.position[2] > rest_height + 0.05
         left_has, right_has = (
-            hand.opening < HELD_OPENING and self.task.holds(contacts, hand.side, "bar") for hand in (left, right)
+            hand.closed and self.task.holds(contacts, hand.side, "bar") for hand in (left, right)
         )
         offered = (
             raised
