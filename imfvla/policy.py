@@ -67,7 +67,9 @@ def build_policy(config: Mapping[str, Any], statistics: Any | None = None) -> Po
             generator=instantiate(config["generator"], _convert_="all"),
         )
     except KeyError as error:
-        raise UserError(f"the configuration lacks the key {error.args[0]!r} that a policy is built from.") from None
+        raise UserError(
+            f"the configuration lacks the key {error.args[0]!r} that a policy is built from."
+        ) from None
     except Exception as error:
         if isinstance(error, UserError):
             raise

@@ -54,7 +54,7 @@ class CompactCNN(nn.Sequential):
 
 
 class ResNet18(nn.Sequential):
-    """ResNet18 with group norm in place of batch norm, 32 pixels a feature: (N, 3, H, W) -> (N, 512, H / 32, W / 32)."""
+    """ResNet18 with group norm for batch norm, 32 pixels a feature: (N, 3, H, W) -> (N, 512, H / 32, W / 32)."""
 
     def __init__(self) -> None:
         super().__init__(

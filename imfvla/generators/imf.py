@@ -11,6 +11,7 @@ Beside the compound loss, the instantaneous case u(z_t, t, t) that the tangent n
 Shapes: B batch, N draws per observation, H steps, A action.
 """
 
+from itertools import pairwise
 from typing import Any, Literal
 
 import torch
@@ -53,7 +54,9 @@ class ImprovedMeanFlow:
         if parametrisation not in ("data", "velocity"):
             raise UserError(f"generator.parametrisation must be data or velocity, found {parametrisation!r}.")
         if compound_target not in ("sample", "network"):
-            raise UserError(f"generator.compound_target must be sample or network, found {compound_target!r}.")
+            raise UserError(
+                f"generator.compound_target must be sample or network, found {compound_target!r}."
+            )
         if draws < 1:
             raise UserError(f"generator.draws must be at least 1, found {draws}.")
         self.parametrisation = parametrisation
@@ -78,7 +81,9 @@ class ImprovedMeanFlow:
     ) -> tuple[Tensor, Tensor]:
         """u and du/dt along (v, 0, 1) in (z, r, t) (paper eq. 6), without gradient."""
         return jvp(
-            lambda z, r, t: self.velocity(core, z, r, t, context), (z, r, t), (v, None, torch.ones_like(t))
+            lambda z, r, t: self.velocity(core, z, r, t, context),
+            (z, r, t),
+            (v, torch.zeros_like(r), torch.ones_like(t)),
         )
 
     def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -130,7 +135,7 @@ class ImprovedMeanFlow:
         """z_r = z_t - (t - r) u(z_t, r, t) over `nfe` equal intervals from t = 1 to 0."""
         times = torch.linspace(1, 0, nfe + 1).to(noise)
         z = noise
-        for t, r in zip(times[:-1], times[1:], strict=True):
+        for t, r in pairwise(times):
             ts, rs = t.expand(len(z)), r.expand(len(z))
             z = z - (t - r) * self.velocity(core, z, rs, ts, context)
         return z.clamp(-self.clip, self.clip)

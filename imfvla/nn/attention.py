@@ -9,7 +9,7 @@ Shapes: B batch, L queries, P prefix tokens, D width, N heads, E = D / N.
 import torch
 from torch import Tensor, nn
 
-from imfvla.nn.forward_mode import product
+from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 
 KeyValue = tuple[Tensor, Tensor]  # keys (B, N, E, P), transposed for the product, and values (B, N, P, E)
@@ -23,14 +23,15 @@ class Attention(nn.Module):
         if width % heads:
             raise ValueError(f"width {width} is not divisible by {heads} heads")
         self.heads = heads
-        self.scale = (width // heads) ** -0.5
         self.query_key_value = Linear(width, 3 * width, bias=False)
+        with torch.no_grad():  # the usual scale of the scores, as part of the queries' weights
+            self.query_key_value.weight[:width] *= (width // heads) ** -0.5
         self.output = Linear(width, width, bias=False)
 
     def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
-        """Queries (B, N, L, E), scaled, and the keys and values of x (B, L, D)."""
+        """Queries (B, N, L, E), and the keys and values of x (B, L, D)."""
         q, k, v = self.query_key_value(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
-        return q.transpose(1, 2) * self.scale, (k.permute(0, 2, 3, 1), v.transpose(1, 2))
+        return q.transpose(1, 2), (k.permute(0, 2, 3, 1), v.transpose(1, 2))
 
     def attend(self, q: Tensor, own: KeyValue, prefix: KeyValue | None = None) -> Tensor:
         """Attention output (B, L, D) of the queries over prefix and own tokens."""
@@ -40,11 +41,10 @@ class Attention(nn.Module):
         else:
             # One softmax over two score blocks: cheaper than concatenating the cached keys and values each time.
             num_prefix = prefix[0].shape[-1]
-            weights = torch.cat((product(q, prefix[0]), q @ keys), dim=-1).softmax(-1)
-            mixed = product(weights[..., :num_prefix], prefix[1]) + weights[..., num_prefix:] @ values
+            weights = torch.cat((affine(q, prefix[0]), q @ keys), dim=-1).softmax(-1)
+            mixed = affine(weights[..., :num_prefix], prefix[1]) + weights[..., num_prefix:] @ values
         return self.output(mixed.transpose(1, 2).flatten(2))
 
     def forward(self, x: Tensor, prefix: KeyValue | None = None) -> Tensor:
         q, own = self.project(x)
         return self.attend(q, own, prefix)
-

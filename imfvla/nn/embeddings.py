@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 
 
@@ -23,5 +24,5 @@ class TimeEmbedding(nn.Module):
         self.mlp = nn.Sequential(Linear(2 * num_frequencies, width), nn.SiLU(), Linear(width, width))
 
     def forward(self, time: Tensor) -> Tensor:
-        angles = time.unsqueeze(-1) * self.frequencies
+        angles = affine(time.unsqueeze(-1), self.frequencies.unsqueeze(0))
         return self.mlp(torch.cat((angles.sin(), angles.cos()), dim=-1))

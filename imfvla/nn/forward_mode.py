@@ -1,8 +1,8 @@
 """Forward-mode differentiation that spends nothing on constants.
 
-PyTorch's own rule for a product multiplies a missing tangent as an array of zeros, so that a matrix product with
-weights costs three products in place of two, and one with a cached context a slow strided one besides. Here the
-tangent of x @ constant is tangent(x) @ constant.
+PyTorch's own rules treat a constant's missing tangent as an array of zeros: a product with weights costs three
+products in place of two, one with a cached context a slow strided one besides, and adding a constant half a
+millisecond of dispatch. Here the tangent of x @ matrix + shift is tangent(x) @ matrix.
 """
 
 from collections.abc import Callable
@@ -13,36 +13,37 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 
-class _ConstantProduct(torch.autograd.Function):
+class _Affine(torch.autograd.Function):
     @staticmethod
-    def forward(x: Tensor, constant: Tensor) -> Tensor:
-        return x @ constant
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.constant = inputs[1]
+    def forward(x: Tensor, matrix: Tensor | None, shift: Tensor | None) -> Tensor:
+        return _affine(x, matrix, shift)
 
     @staticmethod
-    def jvp(ctx: Any, x_tangent: Tensor, constant_tangent: None) -> Tensor:
-        return x_tangent @ ctx.constant
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor | None, Tensor | None], output: Tensor) -> None:
+        ctx.matrix = inputs[1]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        return tangent.clone() if ctx.matrix is None else tangent @ ctx.matrix
 
 
-def product(x: Tensor, constant: Tensor) -> Tensor:
-    """x @ constant, where constant has no tangent of its own; in reverse mode an ordinary product."""
+def _affine(x: Tensor, matrix: Tensor | None, shift: Tensor | None) -> Tensor:
+    y = x if matrix is None else x @ matrix
+    return y if shift is None else y + shift
+
+
+def affine(x: Tensor, matrix: Tensor | None, shift: Tensor | None = None) -> Tensor:
+    """x @ matrix + shift, either of them None for absent, both constants in forward mode."""
     if forward_ad.unpack_dual(x).tangent is None:
-        return x @ constant
-    return _ConstantProduct.apply(x, constant)
+        return _affine(x, matrix, shift)
+    return _Affine.apply(x, matrix, shift)
 
 
 def jvp(
-    function: Callable[..., Tensor], primals: tuple[Tensor, ...], tangents: tuple[Tensor | None, ...]
+    function: Callable[..., Tensor], primals: tuple[Tensor, ...], tangents: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """function(*primals) and its derivative along `tangents` (None: constant), both without gradient."""
+    """function(*primals) and its derivative along `tangents`, both without gradient."""
     with torch.no_grad(), forward_ad.dual_level():
-        duals = (
-            x if tangent is None else forward_ad.make_dual(x, tangent)
-            for x, tangent in zip(primals, tangents, strict=True)
-        )
+        duals = (forward_ad.make_dual(*pair) for pair in zip(primals, tangents, strict=True))
         output = forward_ad.unpack_dual(function(*duals))
-        tangent = torch.zeros_like(output.primal) if output.tangent is None else output.tangent
-        return output.primal, tangent
+        return output.primal, output.tangent

@@ -11,9 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from imfvla.nn.forward_mode import product
-
-EPS = 1e-6
+from imfvla.nn.forward_mode import affine
 
 
 class History(Protocol):
@@ -71,6 +69,8 @@ class AttentionResidual(nn.Module):
             raise ValueError(f"readout must be 'sum' or 'attn', found {readout!r}")
         self.readout_kind = readout
         self.num_sublayers = num_sublayers
+        self.eps: Tensor
+        self.register_buffer("eps", torch.tensor(1e-6), persistent=False)
         self.query = nn.Parameter(torch.zeros(num_sublayers + (readout == "attn"), width))
 
     def begin(self, embedding: Tensor) -> History:
@@ -80,8 +80,8 @@ class AttentionResidual(nn.Module):
 
     def scores(self, increment: Tensor) -> Tensor:
         """w_l . RMSNorm(y) for the queries of all sublayers at once: (B, T, D) -> (B, T, number of queries)."""
-        norm = torch.linalg.vector_norm(increment, dim=-1, keepdim=True)
-        return product(increment, self.query.T) * (increment.shape[-1] ** 0.5 / (norm + EPS))
+        mean_square = affine(increment.square().mean(-1, keepdim=True), None, self.eps)
+        return affine(increment, self.query.T) * mean_square.rsqrt()
 
 
 class _Increments:

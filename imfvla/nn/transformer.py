@@ -3,7 +3,7 @@
 - Context, time and action tokens run through the same weights. Context tokens do not see action tokens, so that
   their keys and values are computed once per observation and serve every flow evaluation, every noise draw and the
   Jacobian-vector product.
-- Sublayers (attention, SwiGLU) have their own pre-norm and read what the residual hands them.
+- Sublayers (attention, SwiGLU) read what the residual hands them, through a pre-norm without gain: the next layer has one.
 - Several consecutive steps of the sequence share one token ("patch").
 - The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
 
@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from imfvla.nn.attention import Attention, KeyValue
 from imfvla.nn.embeddings import TimeEmbedding
+from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 
 
@@ -62,9 +63,9 @@ class Block(nn.Module):
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attention_norm = nn.LayerNorm(width, bias=False)
+        self.attention_norm = nn.LayerNorm(width, elementwise_affine=False)
         self.attention = Attention(width, heads)
-        self.mlp_norm = nn.LayerNorm(width, bias=False)
+        self.mlp_norm = nn.LayerNorm(width, elementwise_affine=False)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
 
@@ -98,7 +99,7 @@ class TransformerCore(nn.Module):
         self.interval = TimeEmbedding(width, max_rad)
         self.blocks = nn.ModuleList(Block(width, heads, mlp_ratio) for _ in range(depth))
         self.residual = residual(2 * depth, width)
-        self.norm = nn.LayerNorm(width, bias=False)
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.output = Linear(width, patch * channels)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
@@ -118,7 +119,8 @@ class TransformerCore(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
-        tokens = self.input(x.unflatten(1, (-1, self.patch)).flatten(2)) + self.position
+        tokens = self.input(x.unflatten(1, (-1, self.patch)).flatten(2))
+        tokens = affine(tokens, None, self.position)
         times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
         history = self.residual.begin(torch.cat((times, tokens), dim=1))
         for block, prefix in zip(self.blocks, context.blocks, strict=True):

@@ -1,0 +1,122 @@
+import functools
+
+import pytest
+import torch
+from torch import nn
+
+from imfvla.nn.forward_mode import jvp
+from imfvla.nn.residual import AttentionResidual, StandardResidual
+from imfvla.nn.transformer import TransformerCore
+
+RESIDUALS = {
+    "standard": StandardResidual,
+    "attnres-sum": functools.partial(AttentionResidual, readout="sum"),
+    "attnres-attn": functools.partial(AttentionResidual, readout="attn"),
+}
+
+
+def make_core(residual, depth=3, dtype=torch.float64):
+    torch.manual_seed(0)
+    core = TransformerCore(
+        steps=8,
+        channels=3,
+        width=16,
+        depth=depth,
+        heads=2,
+        patch=2,
+        mlp_ratio=2.0,
+        max_rad=10.0,
+        residual=RESIDUALS[residual],
+    ).to(dtype)
+    nn.init.normal_(core.output.weight, std=0.3)
+    if residual != "standard":
+        nn.init.normal_(core.residual.query)
+    return core
+
+
+def inputs(batch=2, dtype=torch.float64):
+    rng = torch.Generator().manual_seed(1)
+    x, context = (torch.randn(batch, *shape, generator=rng, dtype=dtype) for shape in ((8, 3), (5, 16)))
+    t = torch.tensor([0.9, 0.5], dtype=dtype)[:batch]
+    return x, t, t / 3, context
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_jacobian_vector_product_equals_central_differences(residual):
+    core = make_core(residual)
+    x, t, r, context = inputs()
+    conditioning = core.condition(context)
+    direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(2), dtype=x.dtype)
+    step = 1e-5
+
+    def f(x, t):
+        return core(x, t, r, conditioning)
+
+    value, derivative = jvp(f, (x, t), (direction, torch.ones_like(t)))
+    with torch.no_grad():
+        difference = (f(x + step * direction, t + step) - f(x - step * direction, t - step)) / (2 * step)
+        torch.testing.assert_close(value, f(x, t))
+    assert (derivative - difference).norm() / difference.norm() < 1e-6
+
+
+def test_fresh_attention_residuals_equal_the_standard_pre_norm_network():
+    standard = make_core("standard")
+    attnres = make_core("attnres-sum")
+    attnres.load_state_dict(standard.state_dict(), strict=False)
+    nn.init.zeros_(attnres.residual.query)
+    for module in (*attnres.modules(), *standard.modules()):
+        if isinstance(module, nn.LayerNorm):
+            module.eps = (
+                0.0  # what the pre-norm reads differs by a factor, which only a norm without it forgets
+            )
+    x, t, r, context = inputs()
+    torch.testing.assert_close(
+        attnres(x, t, r, attnres.condition(context)),
+        standard(x, t, r, standard.condition(context)),
+    )
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_cached_context_equals_one_joint_pass(residual):
+    """The prefix does not see the suffix: running it for each row alone or once for several draws is the same."""
+    core = make_core(residual)
+    x, t, r, context = inputs()
+    cached = core.condition(context)
+    twice = cached.repeat(2)
+    many = core(x.repeat_interleave(2, 0), t.repeat_interleave(2), r.repeat_interleave(2), twice)
+    one = torch.cat(
+        [core(x[i : i + 1], t[i : i + 1], r[i : i + 1], cached.rows(slice(i, i + 1))) for i in (0, 1)]
+    )
+    torch.testing.assert_close(many[::2], one)
+    torch.testing.assert_close(many[1::2], one)
+
+
+def test_every_parameter_learns():
+    core = make_core("attnres-attn")
+    x, t, r, context = inputs()
+    core(x, t, r, core.condition(context)).square().sum().backward()
+    assert [name for name, p in core.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_the_first_sublayer_has_one_source_and_its_query_no_gradient():
+    core = make_core("attnres-sum")
+    x, t, r, context = inputs()
+    core(x, t, r, core.condition(context)).square().sum().backward()
+    gradients = core.residual.query.grad.abs().sum(1)
+    assert gradients[0] == 0
+    assert (gradients[1:] > 0).all()
+
+
+def test_a_patch_that_does_not_divide_the_horizon_is_refused():
+    with pytest.raises(ValueError, match="must divide the 8 steps"):
+        TransformerCore(
+            steps=8,
+            channels=3,
+            width=16,
+            depth=1,
+            heads=2,
+            patch=3,
+            mlp_ratio=2.0,
+            max_rad=10.0,
+            residual=StandardResidual,
+        )
