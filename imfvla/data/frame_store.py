@@ -73,7 +73,7 @@ class FrameStore:
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it and run again."
             ) from error

@@ -1,7 +1,7 @@
 """McapSink: writes one episode, demonstration or rollout, as one MCAP file."""
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -148,25 +148,17 @@ class McapSink:
         data = message if isinstance(message, bytes) else messages.dump(message)
         self._writer.add_message(self._channels[topic], self._time, data, self._time)
 
-    def _cleaning_up(self) -> "_CleaningUp":
-        return _CleaningUp(self)
-
-
-class _CleaningUp:
-    """Aborts the sink when its block fails, and names the file where the file system is the reason."""
-
-    def __init__(self, sink: McapSink) -> None:
-        self._sink = sink
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type | None, error: BaseException | None, traceback: object) -> None:
-        if error is None:
-            return
-        self._sink.abort()
-        if isinstance(error, OSError):
+    @contextmanager
+    def _cleaning_up(self) -> Iterator[None]:
+        """Aborts when its block fails, and names the file where the file system is the reason."""
+        try:
+            yield
+        except OSError as error:
+            self.abort()
             raise UserError(
-                f"Cannot record {self._sink.path}: {error.strerror or error}. "
+                f"Cannot record {self.path}: {error.strerror or error}. "
                 "Free disk space or choose another directory, and run the command again."
             ) from error
+        except BaseException:
+            self.abort()
+            raise
