@@ -66,9 +66,7 @@ def run_name(overrides: Sequence[str]) -> str:
     """
     parts = sorted({text.lstrip("+~") for text in overrides if not _is_execution_key(_key(text))})
     joined = ",".join(parts)
-    name = re.sub(
-        r"[^A-Za-z0-9_.,=+-]+", "-", joined.replace("[", "").replace("]", "").replace("/", "-")
-    ).strip("-.")
+    name = re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", re.sub(r"[\[\]\s]", "", joined)).strip("-.")
     if len(name) > MAX_RUN_NAME:
         name = f"{name[: MAX_RUN_NAME - 9]}-{hashlib.sha256(joined.encode()).hexdigest()[:8]}"
     return name or "default"

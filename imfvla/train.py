@@ -1,4 +1,4 @@
-"""python -m imfvla.train +exp=socket_ph32_exec16: collects what is missing, trains, evaluates, prints its row."""
+"""python -m imfvla.train +exp=NAME: collects what is missing, trains, evaluates and prints the table row."""
 
 from typing import Any
 

@@ -1,0 +1,93 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from imfvla.entry import entry_point, output_directory
+from imfvla.errors import UserError
+
+
+@pytest.fixture(autouse=True)
+def _in_tmp(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@entry_point("train")
+def command(config):
+    if config["seed"] == 1:
+        raise UserError("seed 1 is bad.")
+    if config["seed"] == 2:
+        raise ZeroDivisionError("a slip of ours")
+    if config["seed"] == 3:
+        raise KeyboardInterrupt
+    (output_directory() / "done").write_text(type(config["horizon"]).__name__)
+
+
+def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
+    command(["+exp=socket_ph32_exec16"])
+    command(["+exp=socket_ph32_exec16"])
+    assert (tmp_path / "runs/socket_ph32_exec16/default/done").read_text() == "dict"
+    assert len(list(tmp_path.rglob("done"))) == 1
+    assert (tmp_path / "runs/socket_ph32_exec16/default/train.log").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["seed=1"], 2, "seed 1 is bad.\n"),
+        (["+exp=nope"], 2, None),
+        (["seed=3"], 130, "Interrupted.\n"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
+    with pytest.raises(SystemExit) as exit_:
+        command(arguments)
+    printed = capfd.readouterr().err
+    assert exit_.value.code == code
+    assert printed.count("\n") == 1
+    assert words in (None, printed)
+
+
+def test_our_own_mistakes_show_a_traceback(capfd):
+    with pytest.raises(SystemExit) as exit_:
+        command(["seed=2"])
+    assert exit_.value.code == 1
+    printed = capfd.readouterr().err
+    assert "Traceback" in printed
+    assert "a slip of ours" in printed
+
+
+def test_unknown_override_makes_no_directory(tmp_path):
+    with pytest.raises(SystemExit):
+        command(["+nope=1"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sweep_runs_all_and_lists_the_failures(tmp_path, capfd):
+    with pytest.raises(SystemExit) as exit_:
+        command(["-m", "seed=0,1,4", "name=sweep"])
+    assert exit_.value.code == 2
+    assert sorted(path.parent.name for path in tmp_path.rglob("done")) == ["seed=0", "seed=4"]
+    assert "seed 1 is bad." in capfd.readouterr().err
+
+
+def test_leaves_the_environment_as_it_was():
+    before, arguments = dict(os.environ), list(sys.argv)
+    command(["seed=5"])
+    assert dict(os.environ) == before
+    assert sys.argv == arguments
+
+
+def test_train_command_tells_a_slip_in_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "imfvla.train", "+exp=nope"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("Unknown exp 'nope': conf/exp has ")
+    assert done.stderr.count("\n") == 1
