@@ -3,7 +3,7 @@
 - Context, time and action tokens run through the same weights. Context tokens do not see action tokens, so that
   their keys and values are computed once per observation and serve every flow evaluation, every noise draw and the
   Jacobian-vector product.
-- Sublayers (attention, SwiGLU) read what the residual hands them, through a pre-norm without gain: the next layer has one.
+- Sublayers (attention, SwiGLU) read what the residual hands them, through a pre-norm whose gain is the next layer's.
 - Several consecutive steps of the sequence share one token ("patch").
 - The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
 

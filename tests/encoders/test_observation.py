@@ -1,0 +1,90 @@
+import pytest
+import torch
+
+from imfvla.encoders.observation import ObservationEncoder
+from imfvla.encoders.tokens import ViewTokens
+from imfvla.encoders.vision import CompactCNN, ResNet18
+from imfvla.instruction import tokenize
+from imfvla.types import Observation
+
+TRUNKS = {"compact": (lambda: CompactCNN(16, 32, 1), 8), "resnet18": (ResNet18, 32)}
+
+
+def encoder(trunk="compact", steps=1):
+    torch.manual_seed(0)
+    made = ObservationEncoder(
+        vision=TRUNKS[trunk][0](),
+        views=2,
+        observed_steps=steps,
+        state_dim=16,
+        width=24,
+        tokens_per_view=2,
+        maps_per_view=4,
+        features_per_map=3,
+    )
+    made.state_normaliser.fit(-torch.ones(16), torch.ones(16))
+    return made
+
+
+def observation(batch=3, steps=1, size=64):
+    rng = torch.Generator().manual_seed(0)
+    return Observation(
+        torch.randint(0, 256, (batch, steps, 2, 3, size, size), generator=rng, dtype=torch.uint8),
+        torch.rand(batch, steps, 16, generator=rng),
+        torch.from_numpy(tokenize("put the peg in the socket")).expand(batch, -1),
+    )
+
+
+@pytest.mark.parametrize("trunk", TRUNKS)
+@pytest.mark.parametrize("steps", [1, 2])
+def test_tokens_count_views_states_and_one_sentence(trunk, steps):
+    tokens = encoder(trunk, steps)(observation(steps=steps))
+    assert tokens.shape == (3, steps * (2 * 2 + 1) + 1, 24)
+    assert tokens.isfinite().all()
+
+
+@pytest.mark.parametrize("trunk", TRUNKS)
+def test_trunks_shrink_pictures_by_their_stride(trunk):
+    make, stride = TRUNKS[trunk]
+    vision = make()
+    assert vision(torch.rand(2, 3, 64, 64)).shape == (2, vision.channels, 64 // stride, 64 // stride)
+
+
+def test_rows_do_not_see_each_other():
+    made, obs = encoder(), observation()
+    alone = Observation(obs.images[1:2], obs.state[1:2], obs.instruction[1:2])
+    torch.testing.assert_close(made(obs)[1:2], made(alone), rtol=1e-4, atol=1e-5)
+
+
+def test_every_part_of_an_observation_matters():
+    made, obs = encoder(), observation()
+    base = made(obs)
+    for changed in (
+        Observation(255 - obs.images, obs.state, obs.instruction),
+        Observation(obs.images, obs.state + 0.1, obs.instruction),
+        Observation(obs.images, obs.state, torch.from_numpy(tokenize("hand it over")).expand(3, -1)),
+    ):
+        assert not torch.allclose(made(changed), base)
+
+
+def test_every_parameter_learns():
+    made = encoder()
+    made(observation()).square().sum().backward()
+    assert [name for name, p in made.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_a_bright_spot_is_located_where_it_is():
+    """With one map that follows the brightness, the pooled position is the spot's."""
+    tokens = ViewTokens(views=1, channels=1, tokens=1, maps=1, features=1, width=3)
+    with torch.no_grad():
+        tokens.maps.fill_(100.0)
+        tokens.output.copy_(torch.eye(3))
+        tokens.identity.zero_()
+    x = torch.zeros(1, 1, 1, 5, 5)
+    x[..., 3, 0] = 1.0
+    torch.testing.assert_close(tokens(x)[0, 0, 1:], torch.tensor([0.5, -1.0]))
+
+
+def test_maps_must_be_shared_evenly_by_tokens():
+    with pytest.raises(ValueError, match="5 attention maps cannot be shared evenly by 2 tokens"):
+        ViewTokens(views=1, channels=1, tokens=2, maps=5, features=1, width=3)

@@ -1,0 +1,153 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from imfvla.errors import UserError
+from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS, tokenize
+from imfvla.policy import build_policy
+from imfvla.types import Batch, Observation
+
+STATISTICS = SimpleNamespace(
+    state_min=np.full(16, -2.0, np.float32),
+    state_max=np.full(16, 2.0, np.float32),
+    action_min=np.full(16, -3.0, np.float32),
+    action_max=np.full(16, 1.0, np.float32),
+)
+
+
+def config(**changes):
+    return {
+        "horizon": {"obs": 1, "pred": 8, "exec": 4},
+        "action_dim": 16,
+        "encoder": {
+            "_target_": "imfvla.encoders.observation.ObservationEncoder",
+            "vision": {
+                "_target_": "imfvla.encoders.vision.CompactCNN",
+                "stem_channels": 16,
+                "channels": 16,
+                "num_blocks": 1,
+            },
+            "views": 2,
+            "observed_steps": 1,
+            "state_dim": 16,
+            "width": 16,
+            "tokens_per_view": 1,
+            "maps_per_view": 2,
+            "features_per_map": 2,
+        },
+        "core": {
+            "_target_": "imfvla.nn.transformer.TransformerCore",
+            "steps": 8,
+            "channels": 16,
+            "width": 16,
+            "depth": 2,
+            "heads": 2,
+            "patch": 4,
+            "mlp_ratio": 2.0,
+            "max_rad": 10.0,
+            "residual": {
+                "_target_": "imfvla.nn.residual.AttentionResidual",
+                "_partial_": True,
+                "readout": "sum",
+            },
+        },
+        "generator": {
+            "_target_": "imfvla.generators.imf.ImprovedMeanFlow",
+            "parametrisation": "data",
+            "times": {"_target_": "imfvla.generators.base.UniformTimes"},
+            "boundary_share": 0.1,
+            "instant_weight": 1.0,
+            "compound_target": "sample",
+            "time_power": 2.0,
+            "adaptive_power": 0.5,
+            "adaptive_offset": 1e-3,
+            "draws": 2,
+            "clip": 1.0,
+        },
+    } | changes
+
+
+def policy(statistics=STATISTICS):
+    torch.manual_seed(0)
+    made = build_policy(config(), statistics)
+    torch.nn.init.normal_(made.core.output.weight, std=0.1)
+    return made
+
+
+def batch(rows=3):
+    rng = torch.Generator().manual_seed(0)
+    obs = Observation(
+        torch.randint(0, 256, (rows, 1, 2, 3, 32, 32), generator=rng, dtype=torch.uint8),
+        torch.rand(rows, 1, 16, generator=rng),
+        torch.from_numpy(tokenize("put the peg in")).expand(rows, -1),
+    )
+    valid = torch.ones(rows, 8, dtype=torch.bool)
+    valid[-1, 5:] = False
+    return Batch(obs, 4 * torch.rand(rows, 8, 16, generator=rng) - 3, valid)
+
+
+def loss(made, data):
+    return made.loss(data, torch.Generator().manual_seed(1))[0]
+
+
+def test_loss_is_unchanged_by_garbage_in_padded_steps():
+    made, data = policy(), batch()
+    garbage = data.actions.clone()
+    garbage[~data.valid] = torch.nan
+    assert torch.equal(loss(made, data), loss(made, Batch(data.obs, garbage, data.valid)))
+
+
+def test_loss_is_a_pure_function_of_batch_and_generator():
+    made, data = policy(), batch()
+    assert torch.equal(loss(made, data), loss(made, data))
+    scalar, logs = made.loss(data, torch.Generator().manual_seed(1))
+    assert scalar.shape == ()
+    assert all(value.shape == () and value.isfinite() for value in logs.values())
+
+
+@pytest.mark.parametrize("nfe", [1, 2, 3])
+def test_predictions_lie_in_the_range_of_the_demonstrated_actions(nfe):
+    made, data = policy(), batch()
+    noise = 10 * torch.randn(3, *made.noise_shape, generator=torch.Generator().manual_seed(2))
+    with torch.inference_mode():
+        chunk = made.predict(data.obs, noise, nfe)
+        assert torch.equal(chunk, made.predict(data.obs, noise, nfe))
+    assert chunk.shape == (3, 8, 16)
+    assert ((chunk >= -3) & (chunk <= 1)).all()
+    assert not torch.equal(chunk[0], chunk[1])
+
+
+def test_a_policy_without_statistics_predicts_nothing_that_looks_valid():
+    made, data = policy(statistics=None), batch()
+    assert made.predict(data.obs, torch.zeros(3, 8, 16), 1).isnan().all()
+
+
+def test_no_evaluation_is_refused():
+    with pytest.raises(UserError, match="at least 1, found 0"):
+        policy().predict(batch().obs, torch.zeros(3, 8, 16), 0)
+
+
+def test_parts_that_do_not_fit_are_refused_in_one_sentence():
+    odd = config()
+    odd["core"] = odd["core"] | {"patch": 3}
+    with pytest.raises(UserError, match=r"core\.patch must divide the 8 steps of horizon\.pred"):
+        build_policy(odd)
+    with pytest.raises(UserError, match=r"exec must not exceed horizon\.pred"):
+        build_policy(config(horizon={"obs": 1, "pred": 8, "exec": 9}))
+    lacking = config()
+    del lacking["core"]
+    with pytest.raises(UserError, match="lacks the key 'core'"):
+        build_policy(lacking)
+
+
+def test_words_become_the_same_ids_everywhere():
+    ids = tokenize("Put the peg into the socket!")
+    assert ids.shape == (MAX_WORDS,)
+    assert ids.dtype == np.int64
+    assert np.array_equal(ids, tokenize("put  the peg, into the SOCKET"))
+    assert ids[1] == ids[4] > 0
+    assert (ids[6:] == 0).all()
+    assert (tokenize("word " * 40) > 0).all()
+    assert ids.max() < NUM_WORD_IDS
