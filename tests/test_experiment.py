@@ -1,0 +1,136 @@
+"""The stages of `imfvla.train` on recorded synthetic episodes; the simulator's part is in test_train.py."""
+
+import json
+
+import pytest
+import torch
+
+from imfvla import experiment
+from imfvla.composition import compose
+from imfvla.errors import UserError
+from imfvla.experiment import run_experiment
+from imfvla.run_directory import DONE, FAILED, RunDirectory
+from imfvla.training.checkpoint import load_policy
+from imfvla.training.logger import read_metrics
+
+TINY = [
+    "observation.image_size=[32,32]",
+    "training.batch_size=2",
+    "training.steps=4",
+    "training.checkpoints=2",
+    "training.log_every=1",
+    "training.save_every_s=0",
+    "training.threads=1",
+]
+
+
+@pytest.fixture
+def calls(synthetic_demonstrations, monkeypatch):
+    """What was asked of collection, evaluation and report, which are not run."""
+    seen: list[tuple] = []
+
+    def collect(config):
+        seen.append(("collect",))
+        return synthetic_demonstrations
+
+    def evaluate(run, **options):
+        seen.append(("evaluate", options))
+
+    monkeypatch.setattr(experiment, "ensure_demonstrations", collect)
+    monkeypatch.setattr(experiment, "evaluate", evaluate)
+    monkeypatch.setattr(experiment, "print_row", lambda run: seen.append(("print",)))
+    return seen
+
+
+def test_does_all_stages_once(calls, tmp_path):
+    config, run = compose("train", TINY), RunDirectory(tmp_path / "run")
+    run_experiment(config, run)
+    assert [name for name, *_ in calls] == ["collect", "evaluate", "print"]
+    assert calls[1][1]["nfe"] == (1, 2, 3)
+    assert run.status()["state"] == DONE
+    assert run.config() == config
+    assert run.weight_steps() == [2, 4]
+    assert [row["step"] for row in read_metrics(run.metrics)] == [1, 2, 3, 4]
+    described = json.loads(run.policy_weights().with_suffix(".json").read_text())
+    assert {"step", "seed", "config_digest", "code", "fingerprint"} <= described.keys()
+
+    files = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"}
+    calls.clear()
+    run_experiment(config, run)
+    assert [name for name, *_ in calls] == ["evaluate", "print"]
+    assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"} == files
+
+
+def test_goes_on_where_it_was_stopped(calls, tmp_path, monkeypatch):
+    config = compose("train", TINY)
+    whole, stopped = RunDirectory(tmp_path / "whole"), RunDirectory(tmp_path / "stopped")
+    run_experiment(config, whole)
+    original = experiment.Trainer._update
+
+    def interrupted(trainer, batch):
+        if trainer.step == 3:
+            raise KeyboardInterrupt
+        return original(trainer, batch)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(experiment.Trainer, "_update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment(config, stopped)
+    assert stopped.status()["state"] == FAILED
+    run_experiment(config, stopped)
+    for step in (2, 4):
+        one, other = load_policy(whole, step).state_dict(), load_policy(stopped, step).state_dict()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
+    run = RunDirectory(tmp_path)
+    run_experiment(compose("train", TINY), run)
+    run_experiment(compose("train", [*TINY, "evaluation.episodes=7", "training.log_every=5"]), run)
+    assert calls[-2][1]["episodes"] == 7
+    with pytest.raises(UserError, match=r"another config: seed was 0, is 1\. Choose another name"):
+        run_experiment(compose("train", [*TINY, "seed=1"]), run)
+    assert run.status()["state"] == DONE
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("horizon.exec=64", r"horizon\.exec must not exceed horizon\.pred"),
+        ("training.steps=0", r"training\.steps must be at least 1"),
+        ("training.steps=many", r"training\.steps must be a whole number, found 'many'"),
+        ("optim.lr=-1", r"optim\.lr must be above 0"),
+        ("evaluation.nfe=fast", r"evaluation\.nfe must be a list"),
+        ("seed=-1", r"seed must be a whole number of at least 0"),
+    ],
+)
+def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, override, message):
+    with pytest.raises(UserError, match=message):
+        run_experiment(compose("train", [*TINY, override]), RunDirectory(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    assert calls == []
+
+
+def test_failure_is_in_the_status(calls, tmp_path, monkeypatch):
+    def fail(config):
+        raise UserError("no demonstrations to be had.")
+
+    monkeypatch.setattr(experiment, "ensure_demonstrations", fail)
+    run = RunDirectory(tmp_path)
+    with pytest.raises(UserError, match="no demonstrations"):
+        run_experiment(compose("train", TINY), run)
+    status = run.status()
+    assert status["state"] == FAILED
+    assert status["error"] == "no demonstrations to be had."
+    assert "Traceback" in status["traceback"]
+
+
+def test_weights_of_another_method_are_refused(calls, tmp_path):
+    run = RunDirectory(tmp_path)
+    run_experiment(compose("train", TINY), run)
+    path = run.path / "config.yaml"
+    path.write_text(path.read_text().replace("image_size", "image_size").replace("depth: ", "depth: 1"))
+    with pytest.raises(
+        UserError, match=r"policy\.safetensors does not fit the configured policy: missing core"
+    ):
+        load_policy(run)
