@@ -266,6 +266,10 @@ class BimanualEnvironment(composer.Environment):
         """16 hex digits that name the start state of this episode."""
         return self._start_digest
 
+    def model_digest(self) -> str:
+        """16 hex digits that name the simulated world: equal digests, equal physics and pictures."""
+        return hashlib.sha256(self.task.root_entity.mjcf_model.to_xml_string().encode()).hexdigest()[:16]
+
     def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
         """Pictures uint8 (H, W, 3) of the named views, of the configured ones by default."""
         return {view: self.render(view, *self.image_size) for view in (views or self.views)}

@@ -1,0 +1,21 @@
+"""python -m imfvla.collect task=socket episodes=200"""
+
+from typing import Any
+
+from imfvla.entry import entry_point
+
+
+@entry_point("collect")
+def main(config: dict[str, Any]) -> None:
+    from imfvla.collection import collect  # after the config is composed: a slip is told at once
+
+    demos = {key: value for key, value in config.items() if key not in ("task", "observation")}
+    report = collect(config["task"], config["observation"], demos)
+    print(
+        f"{report.directory}: {report.num_episodes} demonstrations, {report.num_new} of them new in "
+        f"{report.wall_s:.0f} s; {report.num_failed} failed and were left out."
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""Demonstrations: episodes of the scripted expert, one MCAP file each, recorded on all cores. Needs no torch to record."""
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.files import write_json
+from imfvla.fingerprint import physical_cores
+from imfvla.options import build, require
+from imfvla.progress import Progress
+from imfvla.recording import McapSink, episode_is_complete
+from imfvla.rollout import run_episode
+
+SEED_LIMIT = 10_000  # demonstrations may use the seeds below
+LOG_NAME = "collection.json"
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """Which demonstrations are wanted and where they live."""
+
+    episodes: int
+    first_seed: int
+    directory: str
+    camera_every: int
+    workers: int | None
+
+    def __post_init__(self) -> None:
+        require(self.episodes >= 1, "demos.episodes", "at least 1", self.episodes)
+        require(0 <= self.first_seed < SEED_LIMIT, "demos.first_seed", f"in 0...{SEED_LIMIT - 1}", self.first_seed)
+        require(self.camera_every >= 1, "demos.camera_every", "at least 1", self.camera_every)
+        require(self.workers is None or self.workers >= 0, "demos.workers", "null or at least 0", self.workers)
+
+
+@dataclass(frozen=True, slots=True)
+class ExpertOptions:
+    """How the expert demonstrates; see `imfvla.tasks.experts.Expert`."""
+
+    modes: int
+    noise: float
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """What is filmed."""
+
+    views: tuple[str, ...]
+    image_size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the content of a folder of demonstrations depends on beside the seeds. Hashable, sent to the workers."""
+
+    task: str
+    variant: str
+    modes: int
+    noise: float
+    views: tuple[str, ...]
+    image_size: tuple[int, int]
+    camera_every: int
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a collection did."""
+
+    directory: Path
+    num_episodes: int
+    num_new: int
+    num_failed: int  # among the seeds up to the last one needed
+    wall_s: float
+
+
+def ensure_demonstrations(config: Mapping[str, Any]) -> Path:
+    """The folder with exactly the demonstrations that `config` (train.yaml composed) asks for.
+
+    What is missing is collected first. Raises UserError as `collect` does.
+    """
+    return collect(config["task"], config["observation"], config["demos"]).directory
+
+
+def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any]) -> Report:
+    """Records demonstrations until `demos.episodes` have succeeded, from `demos.first_seed` on.
+
+    Each success becomes `episode-<seed>.mcap` in a folder of `demos.directory` named after task, variant, modes and
+    image size. Complete files are kept, so that an interrupted collection goes on; the seeds of failed demonstrations
+    are listed in `collection.json`. The seeds that are used depend on the settings alone, not on how the work was
+    shared out. Where the folder holds more than is asked for, a folder of links to those asked for is returned.
+
+    Raises:
+        UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
+    """
+    options = build(DemoOptions, demos, "demos")
+    expert = build(ExpertOptions, task["expert"], "task.expert")
+    shown = build(ViewOptions, {k: observation[k] for k in ("views", "image_size")}, "observation")
+    settings = Settings(
+        task=task["name"],
+        variant=task["variant"],
+        **asdict(expert),
+        views=shown.views,
+        image_size=shown.image_size,
+        camera_every=options.camera_every,
+    )
+    began = time.perf_counter()
+    height, width = settings.image_size
+    name = f"{settings.task}-{settings.variant}-modes{settings.modes}-{height}x{width}"
+    directory = Path(options.directory) / name
+    log = _Log(directory, settings)
+    chosen = {seed for seed in _seeds_on_file(directory) if episode_is_complete(_path(directory, seed))}
+    workers = physical_cores() if options.workers is None else options.workers
+    num_new = _record_missing(directory, settings, options, workers, log, chosen)
+    wanted = sorted(seed for seed in chosen if seed >= options.first_seed)[: options.episodes]
+    num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in log.failed)
+    if len(wanted) < len(_seeds_on_file(directory)):
+        directory = _link_folder(directory, wanted, options)
+    return Report(directory, len(wanted), num_new, num_failed, time.perf_counter() - began)
+
+
+def _record_missing(
+    directory: Path, settings: Settings, options: DemoOptions, workers: int, log: "_Log", chosen: set[int]
+) -> int:
+    """Adds to `chosen` the seeds that succeed until there are enough; returns how many were recorded."""
+    batch = _next_batch(options, chosen, log.failed)
+    if not batch:
+        return 0
+    from imfvla.workers import worker_pool
+
+    num_new, title = 0, f"demonstrations of {settings.task}"
+    with (
+        worker_pool(min(workers, len(batch))) as run_all,
+        Progress(title, options.episodes, done=options.episodes - len(batch)) as bar,
+    ):
+        while batch:
+            for seed, success in run_all(record_demonstration, [(settings, directory, s) for s in batch]):
+                if success:
+                    chosen.add(seed)
+                    num_new += 1
+                    bar.advance(f"{len(log.failed)} failed")
+                else:
+                    log.add_failure(seed)
+            batch = _next_batch(options, chosen, log.failed)
+    return num_new
+
+
+def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> list[int]:
+    """The lowest untried seeds, as many as there would be enough successes if all of them succeeded."""
+    batch: list[int] = []
+    num_good = 0
+    for seed in range(options.first_seed, SEED_LIMIT):
+        if num_good + len(batch) == options.episodes:
+            return batch
+        if seed in chosen:
+            num_good += 1
+        elif seed not in failed:
+            batch.append(seed)
+    if num_good + len(batch) == options.episodes:
+        return batch
+    raise UserError(
+        f"demos.episodes={options.episodes} cannot be had: the seeds for demonstrations end at {SEED_LIMIT - 1}, "
+        f"and from {options.first_seed} on {len(failed)} failed; ask for fewer or lower demos.first_seed."
+    )
+
+
+def record_demonstration(settings: Settings, directory: Path, seed: int) -> tuple[int, bool]:
+    """Plays the expert from `seed` into its file; of a failed demonstration no file is left. Runs in a worker."""
+    env, expert = _stage_for(settings)
+    path = _path(directory, seed)
+    sink = McapSink(path, lossless=True, render_every=settings.camera_every)
+    result = run_episode(env, expert, seed, [sink], kind="demonstration", config=asdict(settings))
+    if not result.success:
+        path.unlink()
+    return seed, result.success
+
+
+@lru_cache(maxsize=1)
+def _stage_for(settings: Settings) -> tuple[Any, Any]:
+    from imfvla import tasks  # here, since a GL backend is picked at import
+    from imfvla.tasks.experts import make_expert
+
+    env = tasks.load(
+        settings.task, variant=settings.variant, image_size=settings.image_size, views=settings.views
+    )
+    return env, make_expert(settings.task, modes=settings.modes, noise=settings.noise)
+
+
+class _Log:
+    """`collection.json`: what the folder was recorded with and which seeds failed."""
+
+    def __init__(self, directory: Path, settings: Settings) -> None:
+        self._path = directory / LOG_NAME
+        env, _ = _stage_for(settings)
+        self._settings = json.loads(json.dumps(asdict(settings))) | {"model": env.model_digest()}
+        self.failed: set[int] = set()
+        if self._path.exists():
+            self._read()
+        else:
+            self._write()
+
+    def add_failure(self, seed: int) -> None:
+        self.failed.add(seed)
+        self._write()
+
+    def _read(self) -> None:
+        remedy = f"choose another demos.directory, or remove {self._path.parent} to record it anew"
+        try:
+            found = json.loads(self._path.read_text(encoding="utf-8"))
+            settings, self.failed = found["settings"], set(found["failed_seeds"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(f"{self._path} is damaged ({error}); {remedy}.") from error
+        for key, wanted in self._settings.items():
+            if settings.get(key) != wanted:
+                raise UserError(
+                    f"{self._path.parent} was recorded with {key}={settings.get(key)!r}, but {wanted!r} is wanted; "
+                    f"{remedy}."
+                )
+
+    def _write(self) -> None:
+        write_json(self._path, {"settings": self._settings, "failed_seeds": sorted(self.failed)})
+
+
+def _path(directory: Path, seed: int) -> Path:
+    return directory / f"episode-{seed:06d}.mcap"
+
+
+def _seeds_on_file(directory: Path) -> list[int]:
+    return sorted(int(path.stem.removeprefix("episode-")) for path in directory.glob("episode-*.mcap"))
+
+
+def _link_folder(directory: Path, seeds: list[int], options: DemoOptions) -> Path:
+    """A folder beside `directory` that links to the recordings of `seeds` alone, rebuilt where it differs."""
+    folder = directory.with_name(f"{directory.name}-seeds{options.first_seed}-n{options.episodes}")
+    folder.mkdir(exist_ok=True)
+    wanted = {_path(folder, seed).name for seed in seeds}
+    for path in folder.glob("episode-*.mcap"):
+        if path.name not in wanted:
+            path.unlink()
+    for name in wanted:
+        if not (folder / name).exists():
+            (folder / name).unlink(missing_ok=True)
+            os.symlink(Path("..") / directory.name / name, folder / name)
+    return folder
+
