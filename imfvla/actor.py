@@ -64,7 +64,7 @@ class ChunkActor:
             steps = self._horizon.observed_steps(step)
             self._images = {s: self._images[s] for s in steps}
             self._states = {s: self._states[s] for s in steps}
-            chunk, inference_ms = self._plan(
+            chunk, inference_ms = self.plan(
                 [self._images[s] for s in steps], [self._states[s] for s in steps], step // self._horizon.exec
             )
             self._check(chunk[: self._horizon.exec])
@@ -73,10 +73,13 @@ class ChunkActor:
         return Decision(action=action, executed=action, images=images, chunk=chunk, inference_ms=inference_ms)
 
     @torch.inference_mode()
-    def _plan(
+    def plan(
         self, images: list[np.ndarray], states: list[np.ndarray], replanning: int
     ) -> tuple[np.ndarray, float]:
-        """From To images (V, H, W, 3) and states (S,) to a chunk, float32 (Tp, A), and the time [ms]."""
+        """From the images of To steps, uint8 (V, H, W, 3), and states, float32 (S,), to a chunk.
+
+        Returns the chunk, float32 (Tp, A), and the time from these arrays to that one [ms].
+        """
         began = time.perf_counter()
         pixels = torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0)
         observation = Observation(

@@ -11,7 +11,8 @@ from imfvla.progress import Progress
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory
-from imfvla.workbench import Build, Job, RunAll, load_workbench, record, roll_out, worker_pool
+from imfvla.workbench import Build, Job, load_workbench, record, roll_out
+from imfvla.workers import RunAll, worker_pool
 
 
 @dataclass(frozen=True, slots=True)

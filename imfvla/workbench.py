@@ -1,11 +1,6 @@
 """What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
 
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +9,6 @@ from typing import Any
 import torch
 
 from imfvla.actor import ChunkActor
-from imfvla.errors import UserError
 from imfvla.reporting.metrics import Row, row_of, untimed
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
@@ -23,7 +17,6 @@ VIDEO_SIZE = (240, 240)  # (H, W) of a view [px]
 VIDEO_EVERY = 2  # control steps between two frames of a video: 25 frames a second
 
 Build = Callable[[Path, int], tuple[Any, Any]]  # run directory, training step -> environment, policy
-RunAll = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,35 +90,3 @@ def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
 @lru_cache(maxsize=1)
 def _bench(build: Build, run: Path, step: int) -> tuple[Any, Any]:
     return build(run, step)
-
-
-@contextmanager
-def worker_pool(count: int) -> Iterator[RunAll]:
-    """Yields `run_all(function, calls)`: results of `function(*arguments)` for each call, as they complete.
-
-    The work is done in `count` fresh processes with one thread each, or in this one for 0.
-    Raises UserError where a worker dies.
-    """
-    if count == 0:
-        yield lambda function, calls: (function(*arguments) for arguments in calls)
-        return
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"  # inherited by the workers, which read it when they load torch
-    executor = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
-
-    def run_all(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        for future in as_completed([executor.submit(function, *arguments) for arguments in calls]):
-            yield future.result()
-
-    try:
-        yield run_all
-    except BrokenProcessPool as error:
-        raise UserError(
-            "A worker process died, perhaps for want of memory: choose fewer workers=... and run the same "
-            "command again; finished episodes are kept."
-        ) from error
-    finally:
-        executor.shutdown(cancel_futures=True)
-        os.environ.pop("OMP_NUM_THREADS")
-        if before is not None:
-            os.environ["OMP_NUM_THREADS"] = before

@@ -14,7 +14,7 @@ Ours = dict[tuple[str, int], Evaluation]  # experiment and nfe -> the run that s
 
 
 def collect(runs: Sequence[RunDirectory]) -> Ours:
-    """The evaluation of each experiment and nfe; of several runs, whole reporting bands first, then the last trained."""
+    """The evaluation of each experiment and nfe; of several, one of the reporting band, else the last trained."""
     found: Ours = {}
     for run in runs:
         for evaluation in rows(run):
