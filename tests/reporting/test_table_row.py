@@ -1,0 +1,142 @@
+"""The row beside the paper's, from a finished run's files alone."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+
+from imfvla.errors import UserError
+from imfvla.reporting.metrics import summarise
+from imfvla.reporting.runs import find_runs, rows
+from imfvla.reporting.table import Table
+from imfvla.reporting.table_row import print_row
+from imfvla.reporting.tables import collect, tables, write
+from imfvla.run_directory import RunDirectory
+
+EXPECTED = Path(__file__).with_name("table_row.md").read_text()
+
+
+def write_evaluation(
+    run: Path,
+    nfe: int,
+    *,
+    first_seed: int = 100_000,
+    step: int = 20,
+    gain: float = 1.0,
+    max_steps: int | None = None,
+) -> None:
+    episodes = [
+        {
+            "seed": first_seed + index, "total_reward": gain * (1200.0 + 200 * index), "num_steps": 700,
+            "max_reward": 3.0 + 2 * (index % 2), "success": index % 2 == 1, "failure": None,
+            "timing": {"wall_s": 2.0, "inference_ms": [4.0, 8.0]},
+        }
+        for index in range(4)
+    ]  # fmt: skip
+    summary = summarise(episodes) | {
+        "experiment": yaml.safe_load((run / "config.yaml").read_text())["name"],
+        "nfe": nfe, "checkpoint_step": step, "seeds": [first_seed, first_seed + 3],
+        "protocol": {"task": "socket", "variant": "default", "max_steps": max_steps},
+        "fingerprint": {"machine": {"cpu": "a fast CPU"}, "workers": 2},
+    }  # fmt: skip
+    summary["inference_ms_p95"] = 7.9
+    folder = run / "rollouts" / f"seeds{first_seed}_nfe{nfe}_step{step}_{max_steps}"
+    folder.mkdir(parents=True)
+    (folder / "summary.json").write_text(json.dumps(summary))
+
+
+def make_run(path: Path, name: str = "socket_ph32_exec16") -> Path:
+    path.mkdir(parents=True)
+    (path / "config.yaml").write_text(yaml.safe_dump({"name": name}))
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run with an evaluation that the paper has (nfe 1) and one that it has not (nfe 4)."""
+    path = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "default")
+    for nfe in (4, 1):
+        write_evaluation(path, nfe)
+    return path
+
+
+def test_the_row_as_markdown_json_and_text(run):
+    console = Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
+    print_row(RunDirectory(run), console)
+    assert (run / "table_row.md").read_text() == EXPECTED
+    first, second = json.loads((run / "table_row.json").read_text())
+    assert (first["nfe"], first["ours"]["avg_return"], first["paper"]["avg_reward"]) == (1, 1500.0, 1275.22)
+    assert (second["nfe"], second["paper"]) == (4, None)
+    text = console.export_text()
+    for cell in ("socket_ph32_exec16 (Table 1)", "1500.00", "1275.22", "15.0-85.0%", "84/100"):
+        assert cell in text
+
+
+def test_of_several_evaluations_the_reporting_band_and_the_last_weights_stand(run):
+    write_evaluation(run, 1, first_seed=10_000, step=30, gain=2)
+    assert rows(RunDirectory(run))[0].summary["avg_return"] == 1500
+    write_evaluation(run, 1, step=30, gain=3, max_steps=5)
+    assert rows(RunDirectory(run))[0].summary["avg_return"] == 1500
+    write_evaluation(run, 1, step=30, gain=4)
+    assert rows(RunDirectory(run))[0].summary["avg_return"] == 6000
+
+
+def test_rows_of_the_selection_band_are_marked(tmp_path):
+    path = make_run(tmp_path / "run")
+    write_evaluation(path, 1, first_seed=10_000)
+    print_row(RunDirectory(path), Console(quiet=True))
+    assert "Not all rows are whole episodes of the reporting band." in (path / "table_row.md").read_text()
+
+
+def test_tables_of_all_runs(run, tmp_path):
+    baseline = make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
+    write_evaluation(baseline, 1, gain=0.5)
+    write_evaluation(run, 3)
+    named = tables(collect(find_runs([tmp_path / "runs", tmp_path / "nothing"])))
+    assert list(named) == ["table1", "table2", "table3", "others"]
+    assert len(named["table1"].rows) == 7 + 3
+    assert len(named["table2"].rows) == 11
+    assert ("Socket iMF infer3 vs ACT", "Avg. reward", "5.23×", "2.00×") in named["table3"].rows
+    assert [row[1] for row in named["others"].rows] == ["4"]
+    paths = write(named, tmp_path / "tables")
+    assert sorted(path.name for path in paths)[:2] == ["others.csv", "others.md"]
+    assert all(path.stat().st_size > 0 for path in paths)
+
+
+def test_a_broken_or_incomplete_summary_is_named(run):
+    path = next(run.glob("rollouts/*_nfe1_*/summary.json"))
+    path.write_text("{")
+    with pytest.raises(UserError, match=r"summary\.json cannot be read as JSON"):
+        rows(RunDirectory(run))
+    path.write_text('{"nfe": 1}')
+    with pytest.raises(UserError, match=r"summary\.json lacks episodes, avg_return"):
+        rows(RunDirectory(run))
+
+
+def test_a_run_without_evaluation_is_named(tmp_path):
+    with pytest.raises(
+        UserError, match=r"has no finished evaluation: make one with python -m imfvla\.evaluate"
+    ):
+        rows(RunDirectory(make_run(tmp_path / "run")))
+
+
+def test_a_table_for_spreadsheets_and_markdown():
+    table = Table("Title", ("a", "b"), (("1, 2", "x|y"),), note="Note.")
+    assert table.csv() == 'a,b\n"1, 2",x|y\n'
+    assert table.markdown() == "## Title\n\n| a | b |\n| --- | --- |\n| 1, 2 | x\\|y |\n\nNote.\n"
+
+
+def test_the_command_needs_neither_torch_nor_a_simulator(run):
+    check = (
+        "import sys; from imfvla.report import main; main(sys.argv[1:]); "
+        "assert not {'torch', 'mujoco', 'dm_control'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check, f"run={run}"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "1275.22" in done.stdout
