@@ -12,6 +12,7 @@ TASK ?= socket
 EPISODES ?= 4
 ARGS ?=
 
+SHIPPED := experiments/pretrained/$(TASK)_ph32_exec16
 VENV := .venv
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
@@ -35,7 +36,8 @@ demos: setup  ## Record the demonstrations of both tasks (ARGS="episodes=200")
 	$(PY) -m imfvla.collect task=transfer $(ARGS)
 
 eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or transfer, EPISODES=4)
-	$(PY) -m imfvla.evaluate run=experiments/pretrained/$(TASK)_ph32_exec16 episodes=$(EPISODES) $(ARGS)
+	$(PY) -m imfvla.evaluate run=$(SHIPPED) episodes=$(EPISODES) nfe=1 $(ARGS)
+	@echo "Videos, and MCAP files for Foxglove beside them:"; ls $(SHIPPED)/rollouts/*/*.mp4
 
 bench: setup  ## Measure simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)

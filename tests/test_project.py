@@ -1,5 +1,6 @@
 """What the project's files promise: pins for every dependency, documented targets, commands that exist."""
 
+import ast
 import re
 import subprocess
 import tomllib
@@ -41,7 +42,7 @@ def test_the_makefile_documents_every_target():
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_only_what_exists(document):
     text = document.read_text()
-    for module in set(re.findall(r"python -m (imfvla[\w.]*)", text)):
+    for module in set(re.findall(r"python -m (imfvla\.\w+)", text)):
         assert (ROOT / (module.replace(".", "/") + ".py")).exists(), module
     for experiment in set(re.findall(r"\+exp=(\w+)", text)):
         assert (ROOT / "conf" / "exp" / f"{experiment}.yaml").exists(), experiment
@@ -50,3 +51,41 @@ def test_documents_name_only_what_exists(document):
         assert target in make_targets(), target
     for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (document.parent / link).exists(), link
+
+
+# What a package may import of imfvla beside itself and `errors`, and which of the heavy packages.
+MAY_IMPORT = {
+    "episode": set(),
+    "horizon": set(),
+    "nn": {"torch"},
+    "encoders": {"torch", "instruction", "nn", "types"},
+    "generators": {"torch", "nn"},
+    "policy": {"torch", "generators", "horizon", "nn", "types"},
+    "tasks": {"mujoco", "dm_control", "episode", "gl"},
+    "recording": {"episode"},
+    "reporting": {"episode", "files", "run_directory"},
+    "data": {"torch", "horizon", "instruction", "recording", "types"},
+}
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_imports_run_one_way(package):
+    folder = ROOT / "imfvla" / package
+    files = sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
+    found = {name: path.name for path in files for name in imported(path)}
+    excess = {
+        name: file for name, file in found.items() if name not in MAY_IMPORT[package] | {package, "errors"}
+    }
+    assert not excess
+
+
+def imported(path: Path) -> set[str]:
+    """Parts of imfvla, and torch, mujoco and dm_control, that a file imports anywhere."""
+    modules = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            modules |= {f"{node.module}.{name.name}" for name in node.names}
+    parts = {module.split(".")[1] for module in modules if module.startswith("imfvla.")}
+    return parts | ({module.split(".")[0] for module in modules} & {"torch", "mujoco", "dm_control"})
