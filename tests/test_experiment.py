@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+import yaml
 
 from imfvla import experiment
 from imfvla.composition import compose
@@ -128,8 +129,9 @@ def test_failure_is_in_the_status(calls, tmp_path, monkeypatch):
 def test_weights_of_another_method_are_refused(calls, tmp_path):
     run = RunDirectory(tmp_path)
     run_experiment(compose("train", TINY), run)
-    path = run.path / "config.yaml"
-    path.write_text(path.read_text().replace("image_size", "image_size").replace("depth: ", "depth: 1"))
+    config = run.config()
+    config["core"]["depth"] += 1
+    (run.path / "config.yaml").write_text(yaml.safe_dump(config))
     with pytest.raises(
         UserError, match=r"policy\.safetensors does not fit the configured policy: missing core"
     ):
