@@ -15,7 +15,6 @@ from imfvla.collection import ensure_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
-from imfvla.fingerprint import fingerprint
 from imfvla.horizon import Horizon
 from imfvla.options import build, require
 from imfvla.policy import build_policy
@@ -96,7 +95,6 @@ def _train(
             "seed": seed,
             "num_parameters": num_parameters,
             "config_digest": config_digest(config, EXECUTION_KEYS),
-            "fingerprint": fingerprint(threads=torch.get_num_threads()),
         },
     )
     trainer.train()

@@ -70,7 +70,7 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
             names = {moment: f"adamw/{moment}/{name}" for moment in MOMENTS}
             if names["step"] in tensors:
                 state.optimiser.state[parameter] = {
-                    "step": tensors[names["step"]],
+                    "step": tensors[names["step"]].to(parameter.device),
                     **{
                         moment: torch.empty_like(parameter).copy_(tensors[names[moment]])
                         for moment in MOMENTS[1:]

@@ -7,8 +7,10 @@ uninterrupted one bit for bit (same machine, same number of threads).
 
 import logging
 import math
+import os
+import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from typing import Any, Protocol
 
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.fingerprint import code_version, physical_cores
+from imfvla.fingerprint import code_version, fingerprint, physical_cores
 from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
@@ -85,7 +87,7 @@ class Trainer:
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         self.precision = precision or choose_precision(options.precision, self.device)
-        self._loss = torch.compile(self.policy.loss) if options.compile else self.policy.loss
+        self._loss = compiled(self.policy.loss) if options.compile else self.policy.loss
 
     @property
     def is_finished(self) -> bool:
@@ -175,7 +177,8 @@ class Trainer:
         description = {
             "step": self.step,
             "train_s": round(self.train_s, 1),
-            "code": code_version(),
+            "precision": self.precision,
+            "fingerprint": fingerprint(device=str(self.device), threads=torch.get_num_threads()),
             **self.description,
         }
         save_weights(self.run.weights_directory(self.step), self.ema.policy, description)
@@ -196,6 +199,15 @@ class Trainer:
 def step_seed(seed: int, step: int) -> int:
     """Seed of all random numbers that a policy draws at `step`."""
     return int(np.random.SeedSequence([seed, LOSS_STREAM, step]).generate_state(1, np.uint64)[0])
+
+
+def compiled(loss: Callable[..., Any]) -> Callable[..., Any]:
+    """`torch.compile` of a loss. Raises UserError where the C++ compiler that it needs is missing."""
+    if not any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++")):
+        raise UserError(
+            "training.compile needs a C++ compiler, none found: install g++ or set training.compile=false."
+        )
+    return torch.compile(loss)
 
 
 def choose_device(wanted: str) -> torch.device:
