@@ -64,6 +64,7 @@ def config(**changes):
             "adaptive_power": 0.5,
             "adaptive_offset": 1e-3,
             "draws": 2,
+            "compound_draws": 1,
             "clip": 1.0,
         },
     } | changes

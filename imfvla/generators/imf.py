@@ -34,6 +34,7 @@ class ImprovedMeanFlow:
     compound_target: "sample" regresses V on e - x (paper); "network" on v, the same network's estimate of its mean.
     time_power: errors of velocities are weighted by t ** time_power; 2 makes them errors of the clean action.
     draws: noise draws per observation; the observation is encoded once for all of them.
+    compound_draws: how many of them enter the compound loss too; the others are the share of draws with r = t.
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
     """
 
@@ -49,6 +50,7 @@ class ImprovedMeanFlow:
         adaptive_power: float,
         adaptive_offset: float,
         draws: int,
+        compound_draws: int,
         clip: float,
     ) -> None:
         if parametrisation not in ("data", "velocity"):
@@ -57,8 +59,10 @@ class ImprovedMeanFlow:
             raise UserError(
                 f"generator.compound_target must be sample or network, found {compound_target!r}."
             )
-        if draws < 1:
-            raise UserError(f"generator.draws must be at least 1, found {draws}.")
+        if not 1 <= compound_draws <= draws:
+            raise UserError(
+                f"generator.compound_draws must lie between 1 and generator.draws={draws}, found {compound_draws}."
+            )
         self.parametrisation = parametrisation
         self.times = times
         self.boundary_share = boundary_share
@@ -66,7 +70,7 @@ class ImprovedMeanFlow:
         self.compound_target = compound_target
         self.time_power = time_power
         self.adaptive_power, self.adaptive_offset = adaptive_power, adaptive_offset
-        self.draws = draws
+        self.draws, self.compound_draws = draws, compound_draws
         self.clip = clip
 
     def velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
@@ -103,27 +107,33 @@ class ImprovedMeanFlow:
         valid = valid.repeat_interleave(self.draws, dim=0)
         noise = torch.randn(x.shape, generator=rng).to(x)
         r, t = (time.to(x) for time in self.intervals(len(x), rng))
+        some = (
+            torch.arange(len(x), device=x.device)
+            .unflatten(0, (batch, self.draws))[:, : self.compound_draws]
+            .flatten()
+        )
         column = t[:, None, None]
         z = (1 - column) * x + column * noise
         target = noise - x
 
         v = self.velocity(core, z, t, t, context)
-        v_fixed = v.detach()
+        instant_error = t**self.time_power * masked_error(v - target, valid)
+
+        z, r, t, context, valid = z[some], r[some], t[some], context.rows(some), valid[some]
+        v_fixed = v.detach()[some]
         u = self.velocity(core, z, r, t, context)
         _, dudt = self.derivative(core, z, r, t, v_fixed, context.detach())
-        compound = u + (t - r)[:, None, None] * dudt
-        compound_target = target if self.compound_target == "sample" else v_fixed
+        change = (t - r)[:, None, None] * dudt
+        compound_target = target[some] if self.compound_target == "sample" else v_fixed
+        compound_error = t**self.time_power * masked_error(u + change - compound_target, valid)
 
-        weight = t**self.time_power
-        instant_error = weight * masked_error(v - target, valid)
-        compound_error = weight * masked_error(compound - compound_target, valid)
-        loss = self.adapt(compound_error) + self.instant_weight * self.adapt(instant_error)
-        logs = {
+        loss = self.instant_weight * self.adapt(instant_error).unflatten(0, (batch, -1)).mean(1)
+        loss = loss + self.adapt(compound_error).unflatten(0, (batch, -1)).mean(1)
+        return loss, {
             "instant_error": instant_error.detach().mean(),
             "compound_error": compound_error.detach().mean(),
-            "dudt_norm": ((t - r)[:, None, None] * dudt).square().mean().sqrt(),
+            "change_rms": change.square().mean().sqrt(),
         }
-        return loss.unflatten(0, (batch, self.draws)).mean(1), logs
 
     def adapt(self, error: Tensor) -> Tensor:
         """error / sg(error + offset) ** power: large errors count for less (arXiv 2505.13447)."""

@@ -20,6 +20,9 @@ class Context:
     def repeat(self, times):
         return self
 
+    def rows(self, index):
+        return self
+
     def detach(self):
         return self
 
@@ -70,6 +73,7 @@ def generator(**changes):
         "adaptive_power": 0.0,
         "adaptive_offset": 1e-3,
         "draws": 1,
+        "compound_draws": 1,
         "clip": 1e6,
     }
     return ImprovedMeanFlow(**(options | changes))
@@ -215,7 +219,7 @@ def test_high_noise_times_stay_near_one():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"parametrisation": "noise"}, {"compound_target": "teacher"}, {"draws": 0}]
+    "changes", [{"parametrisation": "noise"}, {"compound_target": "teacher"}, {"compound_draws": 2}]
 )
 def test_impossible_choices_are_refused_by_name(changes):
     with pytest.raises(UserError, match=f"generator.{next(iter(changes))}"):
