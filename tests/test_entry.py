@@ -30,6 +30,7 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
     assert (tmp_path / "runs/socket_ph32_exec16/default/done").read_text() == "dict"
     assert len(list(tmp_path.rglob("done"))) == 1
     assert (tmp_path / "runs/socket_ph32_exec16/default/train.log").exists()
+    assert not list(tmp_path.rglob(".hydra"))
 
 
 @pytest.mark.parametrize(

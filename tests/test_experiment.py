@@ -103,6 +103,7 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("training.steps=many", r"training\.steps must be a whole number, found 'many'"),
         ("optim.lr=-1", r"optim\.lr must be above 0"),
         ("evaluation.nfe=fast", r"evaluation\.nfe must be a list"),
+        ("generator.parametrisation=x", r"generator\.parametrisation must be data or velocity"),
         ("seed=-1", r"seed must be a whole number of at least 0"),
     ],
 )
