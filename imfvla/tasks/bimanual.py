@@ -54,7 +54,7 @@ class _Ids:
     qpos: np.ndarray  # (16,) of the joints in the order of ACTION_NAMES; a gripper's first finger
     start: np.ndarray  # (18,) of all arm and finger joints, arms in the order of SIDES
     grip: dict[str, int]  # side -> site
-    fingers: dict[str, tuple[int, int]]  # side -> geoms
+    fingers: dict[str, tuple[frozenset[int], ...]]  # side -> geoms of each finger
     body: dict[str, int]  # prop -> body
     free: dict[str, int]  # prop -> first qpos of its free joint
     geoms: dict[str, np.ndarray]  # prop -> bool (num_geoms,)
@@ -106,7 +106,13 @@ class BimanualTask(composer.Task):
             qpos=np.array([address(n) for side in SIDES for n in joint[side][:8]]),
             start=np.array([address(n) for side in SIDES for n in joint[side]]),
             grip={side: model.name2id(f"{side}/grip", "site") for side in SIDES},
-            fingers={side: tuple(model.name2id(f"{side}/finger_{f}", "geom") for f in "ab") for side in SIDES},
+            fingers={
+                side: tuple(
+                    frozenset(model.name2id(f"{side}/finger_{f}_{pad}", "geom") for pad in ("near", "far"))
+                    for f in "ab"
+                )
+                for side in SIDES
+            },
             body=body,
             free={name: int(model.jnt_qposadr[model.body_jntadr[i]]) for name, i in body.items()},
             geoms={name: np.asarray(model.geom_bodyid) == i for name, i in body.items()},
@@ -165,12 +171,12 @@ class BimanualTask(composer.Task):
     def holds(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether both fingers of one arm touch the prop."""
         other = self._partners(contacts, name)
-        return all(finger in other for finger in self._ids.fingers[side])
+        return all(finger & other for finger in self._ids.fingers[side])
 
     def touches(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether any finger of one arm touches the prop."""
         other = self._partners(contacts, name)
-        return any(finger in other for finger in self._ids.fingers[side])
+        return any(finger & other for finger in self._ids.fingers[side])
 
     def on_table(self, contacts: np.ndarray, name: str) -> bool:
         """Whether the prop touches the table."""

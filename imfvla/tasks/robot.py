@@ -17,9 +17,13 @@ FINGER_TRAVEL = 0.045  # of each finger; the opening is twice that
 FINGER_LENGTH = 0.08
 FINGERTIP = 0.006  # how far the fingers reach beyond the grip point
 JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
-STIFFNESS = (4000.0, 4000.0, 2500.0, 2500.0, 800.0, 800.0, 400.0)  # [N m / rad]
-LAG_S = 0.03  # damping over stiffness: joints follow their targets like a first-order filter with this time constant
-GRIP_GAIN = 12.0  # per unit of opening; about 35 N at each finger around a 24 mm bar
+# Motors are heavy for their damping on purpose: the contact solver knows inertia but not damping, and where damping times
+# the time step exceeds the inertia its forces are wrong, so that held things jump.
+STIFFNESS = (2500.0, 2500.0, 1500.0, 1500.0, 400.0, 400.0, 200.0)  # [N m / rad]
+ARMATURE = (1.0, 1.0, 0.7, 0.7, 0.2, 0.2, 0.15)  # [kg m^2]
+LAG_S = 0.04  # damping over stiffness: joints follow their targets nearly like a first-order filter
+FINGER_ARMATURE = 0.8  # [kg]
+GRIP_GAIN, GRIP_LAG_S = 6.0, 0.045  # force per unit of opening: some 18 N at each finger around a 24 mm bar
 HAND_BITS = {"left": 4, "right": 8}  # collision groups; table 1, objects 2
 TABLE_BIT, OBJECT_BIT = 1, 2
 HOME_REACH, HOME_HEIGHT = 0.26, 0.25  # of the point between the fingertips, from the base
@@ -91,7 +95,7 @@ class Arm(composer.Entity):
             name="gripper",
             tendon="opening",
             kp=GRIP_GAIN,
-            kv=0.07 * GRIP_GAIN,
+            kv=GRIP_LAG_S * GRIP_GAIN,
             ctrllimited=True,
             ctrlrange=[0, 1],
         )
@@ -105,7 +109,7 @@ class Arm(composer.Entity):
             axis=[0, 1, 0] if axis == "y" else [0, 0, 1],
             limited=True,
             range=JOINT_LIMITS[index - 1],
-            armature=0.1 if index < 5 else 0.02,
+            armature=ARMATURE[index - 1],
         )
         return link
 
@@ -125,7 +129,11 @@ class Arm(composer.Entity):
         )
 
     def _add_gripper(self, hand: mjcf.Element) -> None:
-        """Two fingers on slides, coupled to move as mirror images, one actuator for the opening in [0, 1]."""
+        """Two fingers on slides, coupled to move as mirror images, one actuator for the opening in [0, 1].
+
+        A finger is a pair of capsules: against a box's face each makes two steady contacts, where two boxes' contacts
+        come and go by the step while their faces are nearly parallel, and let things drop.
+        """
         solid = {
             "contype": HAND_BITS[self.side],
             "conaffinity": TABLE_BIT + OBJECT_BIT + sum(HAND_BITS.values()) - HAND_BITS[self.side],
@@ -148,13 +156,14 @@ class Arm(composer.Entity):
             joints.append(
                 finger.add(
                     "joint", name=f"finger_{name}", type="slide", axis=[sign, 0, 0], limited=True,
-                    range=[0, FINGER_TRAVEL], armature=0.1, damping=2.0,
+                    range=[0, FINGER_TRAVEL], armature=FINGER_ARMATURE,
                 )
             )  # fmt: skip
-            finger.add(
-                "geom", name=f"finger_{name}", type="box", size=[0.006, 0.011, FINGER_LENGTH / 2],
-                pos=[0, 0, -FINGER_LENGTH / 2], rgba=_FINGER, mass=0.05, **solid,
-            )  # fmt: skip
+            for pad, aside in (("near", -0.008), ("far", 0.008)):
+                finger.add(
+                    "geom", name=f"finger_{name}_{pad}", type="capsule", size=[0.006],
+                    fromto=[0, aside, -0.006, 0, aside, -FINGER_LENGTH], rgba=_FINGER, mass=0.025, **solid,
+                )  # fmt: skip
         tendon = self._root.tendon.add("fixed", name="opening")
         for joint in joints:
             tendon.add("joint", joint=joint, coef=0.5 / FINGER_TRAVEL)

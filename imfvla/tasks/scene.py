@@ -19,8 +19,7 @@ class Scene(composer.Arena):
         root.compiler.angle = "radian"
         root.option.timestep = PHYSICS_TIMESTEP_S
         root.option.integrator = "implicitfast"
-        root.option.cone = "elliptic"
-        root.option.impratio = 10
+        root.option.cone = "pyramidal"
         root.option.iterations = 50
         root.option.ls_iterations = 50
         root.statistic.meansize = 0.05

@@ -15,7 +15,7 @@ from imfvla.errors import UserError
 from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, BimanualTask, Pose
 from imfvla.tasks.kinematics import ArmKinematics, about_z, rotation_matrix, rotation_vector
 
-CARROT_S = 0.055  # the arms' lag and half a control step: how far ahead of the hand its command lies
+CARROT_S = 0.065  # the arms' lag and half a control step: how far ahead of the hand its command lies
 SPEED, TURN_SPEED = 0.125, 2.0  # m/s, rad/s
 GRASP_HEIGHT = 0.014  # of the point between the fingertips above the table
 HELD_OPENING = 0.33  # a gripper around a bar measures 0.27
