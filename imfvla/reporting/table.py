@@ -2,15 +2,18 @@
 
 import csv
 import io
+import re
 import sys
 from dataclasses import dataclass
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
+from rich.text import Text
 
 WIDE = 160  # characters a line where no terminal says how many it has
 NOTHING = "-"
+NUMERIC = r"-|[-+]?[\d.]+[-/%×\d.]*"  # a dash, a number, a count of so many, an interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +47,14 @@ class Table:
         """To the terminal, or to `console`."""
         if console is None:
             console = Console(width=None if sys.stdout.isatty() else WIDE)
+        title, note = Text(self.title, "bold"), Text(self.note) if self.note else None
         table = RichTable(
-            title=self.title, caption=self.note or None, box=box.SIMPLE_HEAD, title_justify="left"
+            title=title, caption=note, box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left"
         )
         for name in self.columns:
             table.add_column(name, justify="right" if _is_numeric(name, self) else "left", overflow="fold")
         for row in self.rows:
-            table.add_row(*row)
+            table.add_row(*map(Text, row))
         console.print(table)
 
 
@@ -61,4 +65,4 @@ def number(value: float | None, digits: int) -> str:
 
 def _is_numeric(name: str, table: Table) -> bool:
     index = table.columns.index(name)
-    return any(row[index][:1].isdigit() for row in table.rows)
+    return all(re.fullmatch(NUMERIC, row[index]) for row in table.rows)

@@ -1,0 +1,55 @@
+"""The time of one action chunk at batch 1 on one thread, from numpy observation to numpy chunk, and its parts."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from imfvla.actor import ChunkActor
+from imfvla.benchmarks.clock import threads, times_ms
+from imfvla.instruction import tokenize
+from imfvla.policy import Policy
+from imfvla.types import Observation
+
+
+def measure_latency(
+    env: Any, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
+) -> dict[str, dict[str, float]]:
+    """Times [ms] by "infer1", ...: median and p95 of a chunk, and the medians of its parts.
+
+    The parts are the encoder with its conditioning, one evaluation of the core, and the overhead: what a chunk takes
+    beyond the encoder and `nfe` evaluations. They are timed in turn with the chunk, so that all see the same machine.
+    """
+    env.reset(seed=0)
+    obs = policy.horizon.obs
+    images, states = [np.stack(list(env.look().values()))] * obs, [env.state()] * obs
+    observation = Observation(
+        images=torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0),
+        state=torch.from_numpy(np.stack(states)).unsqueeze(0),
+        instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
+    )
+    noise, one, zero = torch.randn(1, *policy.noise_shape), torch.ones(1), torch.zeros(1)
+    measured = {}
+    with threads(num_threads), torch.inference_mode():
+        context = policy.core.condition(policy.encoder(observation))
+        for number in nfe:
+            actor = ChunkActor(policy, policy.horizon, number, noise_seed=0)
+            actor.reset(env, 0)
+            chunk, encoder, core = times_ms(
+                [
+                    lambda actor=actor: actor.plan(images, states, 0),
+                    lambda: policy.core.condition(policy.encoder(observation)),
+                    lambda: policy.core(noise, one, zero, context),
+                ],
+                calls,
+                warm_up,
+            )
+            measured[f"infer{number}"] = {
+                "median_ms": float(np.median(chunk)),
+                "p95_ms": float(np.percentile(chunk, 95)),
+                "encoder_ms": float(np.median(encoder)),
+                "core_evaluation_ms": float(np.median(core)),
+                "overhead_ms": float(np.median(chunk - encoder - number * core)),
+            }
+    return measured

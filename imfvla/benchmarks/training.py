@@ -1,0 +1,140 @@
+"""Training samples per second, where the time of a step goes, and how much of the machine's peak it uses."""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from imfvla.benchmarks.clock import times_ms
+from imfvla.options import build
+from imfvla.policy import Policy
+from imfvla.run_directory import RunDirectory
+from imfvla.training.data import make_loader, prepare_windows
+from imfvla.training.loop import Trainer
+from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.precision import autocast
+from imfvla.types import Batch
+
+GEMM = 2048  # rows and columns of the matrices that the peak is measured with
+PARTS = ("data", "encoder", "core", "jvp", "backward", "optimiser")
+
+
+def measure_training(
+    config: Mapping[str, Any], policy: Policy, demonstrations: Path, scratch: Path, steps: int
+) -> dict[str, Any]:
+    """Trains `policy` for a few steps on recorded demonstrations, as `imfvla.train` would, and takes times.
+
+    The parts are means over `steps` steps [ms]: waiting for data, encoder and conditioning, core and loss
+    without the Jacobian-vector product, that product, backward, and clipping with optimiser and average
+    of the weights.
+    """
+    options = build(TrainingOptions, {**config["training"], "steps": steps, "checkpoints": 1}, "training")
+    optim = build(OptimOptions, config["optim"], "optim")
+    windows = prepare_windows(config, demonstrations)
+    trainer = Trainer(
+        policy, make_loader(config, windows), RunDirectory(scratch), options, optim, seed=0, description={}
+    )
+    num_threads, precision = torch.get_num_threads(), trainer.precision
+    batches = make_loader(config, windows)
+    try:
+        batch = next(batches).to(trainer.device)
+        flops = count_flops(policy, batch, precision, trainer.device)
+        spent: dict[str, float] = defaultdict(float)
+        for index in range(steps + 2):
+            if index == 2:  # the first steps warm up
+                spent.clear()
+            _step(trainer, batches, spent)
+    finally:
+        batches.close()
+        trainer.batches.close()
+    parts = {part: 1e3 * spent[part] / steps for part in PARTS}
+    step_ms = sum(parts.values())
+    peak = peak_flops(precision, trainer.device)
+    return {
+        "samples_per_s": 1e3 * options.batch_size / step_ms,
+        "step_ms": step_ms,
+        **{f"{part}_ms": value for part, value in parts.items()},
+        "batch_size": options.batch_size,
+        "threads": num_threads,
+        "precision": precision,
+        "gflop_per_step": flops / 1e9,
+        "achieved_gflops": flops / step_ms / 1e6,
+        "peak_gflops": peak / 1e9,
+        "share_of_peak": 1e3 * flops / step_ms / peak,
+    }
+
+
+def peak_flops(precision: str, device: torch.device) -> float:
+    """Floating-point operations per second of a large matrix product, with the present number of threads."""
+    a = torch.randn(GEMM, GEMM, device=device, dtype=torch.bfloat16 if precision == "bf16" else torch.float32)
+    taken = times_ms([lambda: (a @ a)[0, 0].item()], calls=5)
+    return 2 * GEMM**3 / (1e-3 * float(taken.min()))
+
+
+def count_flops(policy: Policy, batch: Batch, precision: str, device: torch.device) -> int:
+    """Floating-point operations of the matrix products and convolutions in one loss and its gradient."""
+    with FlopCounterMode(display=False) as counter:
+        with autocast(precision, device):
+            loss, _ = policy.loss(batch, torch.Generator().manual_seed(0))
+        loss.backward()
+    policy.zero_grad(set_to_none=True)
+    return counter.get_total_flops()
+
+
+def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -> None:
+    """One step of training in its parts, adding the time of each [s] to `spent`."""
+    policy = trainer.policy
+    with _timed(spent, "data"):
+        batch = next(batches).to(trainer.device)
+    with autocast(trainer.precision, trainer.device):
+        with _timed(spent, "encoder"):
+            context = policy.core.condition(policy.encoder(batch.obs))
+        with _timed(spent, "core"), _timed_derivative(policy.generator, spent):
+            actions = policy.action_normaliser.normalise(batch.actions)
+            actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
+            loss, _ = policy.generator.loss(
+                policy.core, context, actions, batch.valid, torch.Generator().manual_seed(trainer.step)
+            )
+            loss = loss.mean()
+    spent["core"] -= spent.pop("derivative", 0.0)
+    with _timed(spent, "backward"):
+        loss.backward()
+    with _timed(spent, "optimiser"):
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), trainer.optim.clip_norm)
+        trainer.optimiser.step()
+        trainer.optimiser.zero_grad(set_to_none=True)
+        trainer.ema.update(trainer.step)
+    trainer.step += 1
+
+
+@contextmanager
+def _timed(spent: dict[str, float], part: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    spent[part] += time.perf_counter() - began
+
+
+@contextmanager
+def _timed_derivative(generator: Any, spent: dict[str, float]) -> Iterator[None]:
+    """Times `generator.derivative`, where the generator has one, apart."""
+    original = getattr(generator, "derivative", None)
+    if original is None:
+        yield
+        return
+
+    def derivative(*args: Any) -> Any:
+        with _timed(spent, "jvp"), _timed(spent, "derivative"):
+            return original(*args)
+
+    generator.derivative = derivative
+    try:
+        yield
+    finally:
+        del generator.derivative
