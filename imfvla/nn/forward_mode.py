@@ -5,6 +5,7 @@ products in place of two, one with a cached context a slow strided one besides, 
 millisecond of dispatch. Here the tangent of x @ matrix + shift is tangent(x) @ matrix.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -43,7 +44,8 @@ def jvp(
     function: Callable[..., Tensor], primals: tuple[Tensor, ...], tangents: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
     """function(*primals) and its derivative along `tangents`, both without gradient."""
-    with torch.no_grad(), forward_ad.dual_level():
+    with torch.no_grad(), forward_ad.dual_level(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script` is deprecated")  # PyTorch's own use of it
         duals = (forward_ad.make_dual(*pair) for pair in zip(primals, tangents, strict=True))
         output = forward_ad.unpack_dual(function(*duals))
         return output.primal, output.tangent
