@@ -11,7 +11,7 @@ from imfvla.progress import Progress
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory
-from imfvla.workbench import Build, Job, load_workbench, record, roll_out
+from imfvla.workbench import Build, Job, gl_renderer, load_workbench, record, roll_out
 from imfvla.workers import RunAll, worker_pool
 
 
@@ -104,6 +104,7 @@ def evaluate(
                 if rollouts.summary is None:
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
                     files = _record_some(job, rows, rollouts, run_all) if recordings else {}
+                    (renderer,) = run_all(gl_renderer, [(job,)])
                     summary = {
                         **summarise(rows),
                         "experiment": config["name"],
@@ -112,7 +113,7 @@ def evaluate(
                         "seeds": [protocol.seeds[0], protocol.seeds[-1]],
                         "protocol": asdict(protocol),
                         "recordings": files,
-                        "fingerprint": fingerprint(threads=1, workers=count),
+                        "fingerprint": fingerprint(threads=1, workers=count, gl_renderer=renderer),
                     }
                     rollouts.finish(rows, summary)
                 summaries.append(rollouts.summary)

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import logging
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -35,11 +36,11 @@ class RolloutLog:
     def __enter__(self) -> "RolloutLog":
         with clear_write_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = open(self.path / ".lock", "a")
+            self._lock = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            self._lock.close()
+            os.close(self._lock)
             raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.") from None
         self._stream = None
         self.rows: list[dict[str, Any]] = []
@@ -68,7 +69,7 @@ class RolloutLog:
     ) -> None:
         if self._stream is not None:
             self._stream.close()
-        self._lock.close()
+        os.close(self._lock)
 
     def _finished(self) -> dict[str, Any] | None:
         path = self.path / "summary.json"
@@ -88,11 +89,15 @@ class RolloutLog:
             lines = self._partial.read_text(encoding="utf-8").splitlines(keepends=True)
         if lines and not lines[-1].endswith("\n"):  # cut off by a kill
             lines.pop()
-        if lines and json.loads(lines[0]) == header:
-            self.rows = [json.loads(line) for line in lines[1:]]
-            log.info("%s: %d episodes are there already.", self.path, len(self.rows))
-        elif lines:
-            log.info("%s belongs to another policy, protocol or code and is begun anew.", self._partial)
+        try:
+            found, *rows = [json.loads(line) for line in lines] or [None]
+        except json.JSONDecodeError:
+            found, rows = "damaged", []
+        if found == header:
+            self.rows = rows
+            log.info("%s: %d episodes are there already.", self.path, len(rows))
+        elif found is not None:
+            log.info("%s is damaged or of another policy, protocol or code: begun anew.", self._partial)
         text = json.dumps(header) + "\n" + "".join(dump_row(row) for row in self.rows)
         write_text(self._partial, text)
         self._stream = open(self._partial, "a", encoding="utf-8")  # noqa: SIM115  closed by finish or on exit

@@ -47,6 +47,19 @@ def load_workbench(run: Path, step: int) -> tuple[Any, Any]:
     return env, load_policy(directory, step)
 
 
+def gl_renderer(job: Job) -> str:
+    """What draws the cameras, by its own name, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+
+    def ask() -> str:
+        from OpenGL import GL  # here, since the platform is chosen when the environment is built
+
+        return GL.glGetString(GL.GL_RENDERER).decode()
+
+    env, _ = _bench(job.build, job.run, job.step)
+    with env.physics.contexts.gl.make_current() as context:
+        return context.call(ask)
+
+
 def roll_out(job: Job, seed: int) -> dict[str, Any]:
     """The row of the episode from `seed`."""
     return _play(job, seed, [])

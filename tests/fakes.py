@@ -1,5 +1,6 @@
 """An environment and a policy whose every answer is known: rollouts without simulator and training."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +30,8 @@ class FakeEnvironment(StillScene):
 
     def __init__(self, time_limit_steps: int = 40, ends_at: int | None = None) -> None:
         super().__init__(views=("front", "top"), image_size=(16, 16))
+        context = SimpleNamespace(call=lambda function: "no renderer")
+        self.physics.contexts = SimpleNamespace(gl=SimpleNamespace(make_current=lambda: nullcontext(context)))
         self.time_limit_steps = time_limit_steps
         self._ends_at = ends_at or time_limit_steps
         self.executed: list[np.ndarray] = []

@@ -60,6 +60,7 @@ def test_rows_and_summary(run):
     assert summary["seeds"] == [100_000, 100_005]
     assert summary["checkpoint_step"] == summary["protocol"]["checkpoint_step"] == 20
     assert summary["fingerprint"]["threads"] == 1
+    assert summary["fingerprint"]["gl_renderer"] == "no renderer"
     assert not (folder / PARTIAL).exists()
 
 

@@ -14,7 +14,7 @@ REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are d
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
     "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
-    "inference_ms_p95", "success_interval",
+    "inference_ms_p95", "success_interval", "failures",
 )  # fmt: skip
 DESCRIPTION = ("experiment", "nfe", "checkpoint_step", "seeds", "protocol", "fingerprint")
 

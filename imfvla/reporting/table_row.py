@@ -1,6 +1,6 @@
 """The row of a run beside the paper's printed one: for the terminal, `table_row.md` and `table_row.json`."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -9,7 +9,7 @@ from rich.console import Console
 from imfvla.files import write_json, write_text
 from imfvla.reporting.metrics import wilson_interval
 from imfvla.reporting.paper import PaperRow
-from imfvla.reporting.runs import METRICS, Evaluation, rows
+from imfvla.reporting.runs import METRICS, Evaluation, evaluations, rows
 from imfvla.reporting.table import NOTHING, Table, number
 from imfvla.run_directory import RunDirectory
 
@@ -19,16 +19,17 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def print_row(run: RunDirectory, console: Console | None = None) -> None:
+def print_row(run: RunDirectory, console: Console | None = None, *, only: Collection[str] = ()) -> None:
     """Prints the rows of a run, one for each nfe, and writes `table_row.md` and `table_row.json` beside its config.
 
-    Raises UserError where the run has no finished evaluation.
+    With `only`, folder names in `rollouts/`, prints those evaluations; the files always hold the rows that stand for
+    the run. Raises UserError where the run has no finished evaluation.
     """
     found = rows(run)
-    table = table_of(found)
-    write_text(run.path / "table_row.md", table.markdown())
+    write_text(run.path / "table_row.md", table_of(found).markdown())
     write_json(run.path / "table_row.json", [as_json(evaluation) for evaluation in found])
-    table.print(console)
+    chosen = [evaluation for evaluation in evaluations(run) if evaluation.folder.name in only]
+    table_of(sorted(chosen, key=lambda evaluation: evaluation.nfe) or found).print(console)
 
 
 def table_of(found: Sequence[Evaluation]) -> Table:
@@ -47,6 +48,9 @@ def table_of(found: Sequence[Evaluation]) -> Table:
     )
     if not all(evaluation.is_reporting for evaluation in found):
         note += " Not all rows are whole episodes of the reporting band."
+    for evaluation in found:
+        for label, count in evaluation.summary["failures"].items():
+            note += f" Nfe {evaluation.nfe}: {count} ended as failed, {label}."
     return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), note)
 
 

@@ -140,3 +140,18 @@ def test_the_command_needs_neither_torch_nor_a_simulator(run):
     )
     assert done.returncode == 0, done.stderr
     assert "1275.22" in done.stdout
+
+
+def test_what_was_just_evaluated_may_be_printed_alone(run):
+    write_evaluation(run, 1, first_seed=10_000, gain=0.1)
+    console = Console(record=True, width=200, file=open("/dev/null", "w"))  # noqa: SIM115
+    print_row(RunDirectory(run), console, only=["seeds10000_nfe1_step20_None"])
+    assert "150.00" in console.export_text()
+    assert (run / "table_row.md").read_text() == EXPECTED
+
+
+def test_episodes_that_ended_as_failed_are_told(run):
+    path = next(run.glob("rollouts/*_nfe4_*/summary.json"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"failures": {"non-finite action": 2}}))
+    print_row(RunDirectory(run), Console(quiet=True))
+    assert "Nfe 4: 2 ended as failed, non-finite action." in (run / "table_row.md").read_text()
