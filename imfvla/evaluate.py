@@ -13,7 +13,7 @@ from imfvla.run_directory import RunDirectory
 
 @entry_point("evaluate")
 def _evaluate(config: dict[str, Any]) -> None:
-    from imfvla.evaluation import Protocol, evaluate  # after the config is checked: a slip is told at once
+    from imfvla.evaluation import evaluate  # after the config is checked: a slip is told at once
     from imfvla.reporting.table_row import print_row
 
     if not config["run"]:
@@ -25,7 +25,7 @@ def _evaluate(config: dict[str, Any]) -> None:
     run = RunDirectory(config["run"])
     options = {key: value for key, value in config.items() if key not in ("run", "nfe")}
     summaries = evaluate(run, nfe=read_nfe(config["nfe"]), **options)
-    folders = [run.rollouts(Protocol(**summary["protocol"]).name) for summary in summaries]
+    folders = [run.rollouts(summary["name"]) for summary in summaries]
     print_row(run, only=[folder.name for folder in folders])
     for folder in folders:
         print(folder)

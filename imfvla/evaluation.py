@@ -5,14 +5,19 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import torch
+
+from imfvla.errors import UserError
 from imfvla.fingerprint import fingerprint, physical_cores
 from imfvla.options import require
 from imfvla.progress import Progress
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
-from imfvla.run_directory import RunDirectory
+from imfvla.run_directory import RunDirectory, flatten
 from imfvla.workbench import Build, Job, gl_renderer, load_workbench, record, roll_out
 from imfvla.workers import RunAll, worker_pool
+
+REQUIRED_KEYS = ("name", "task.name", "task.variant", "observation.views", "observation.image_size")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,16 +33,22 @@ class Protocol:
     first_seed: int
     episodes: int
     max_steps: int | None  # control steps of an episode, None for all of them
+    device: str  # "cpu" or "cuda", where the policy computes
 
     @property
     def seeds(self) -> range:
         return range(self.first_seed, self.first_seed + self.episodes)
 
-    @property
-    def name(self) -> str:
-        """The folder in `rollouts/`."""
-        cut = "" if self.max_steps is None else f"_max{self.max_steps}"
-        return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{cut}"
+    def name(self, last_step: int) -> str:
+        """The folder in `rollouts/`: seeds and nfe, and what is unusual where the weights of `last_step` are usual."""
+        unusual = {
+            f"_step{self.checkpoint_step}": self.checkpoint_step != last_step,
+            f"_noise{self.noise_seed}": self.noise_seed != 0,
+            f"_max{self.max_steps}": self.max_steps is not None,
+            f"_{self.device}": self.device != "cpu",
+        }
+        suffixes = "".join(text for text, applies in unusual.items() if applies)
+        return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{suffixes}"
 
 
 def evaluate(
@@ -50,6 +61,7 @@ def evaluate(
     checkpoint: int | str = "last",
     noise_seed: int = 0,
     max_steps: int | None = None,
+    device: str = "cpu",
     recordings: bool = True,
     overwrite: bool = False,
     build: Build = load_workbench,
@@ -66,6 +78,7 @@ def evaluate(
       checkpoint: training step of the weights, or "last".
       noise_seed: of the noise streams; equal for policies that are to be compared.
       max_steps: control steps of an episode, None for all.
+      device: where the policy computes: "cpu" or "cuda".
       build: makes environment and policy, in each worker once.
 
     Returns:
@@ -80,8 +93,19 @@ def evaluate(
     require(bool(nfe) and min(nfe) >= 1, "nfe", "one or more whole numbers of at least 1", list(nfe))
     require(workers is None or workers >= 0, "workers", "null or at least 0", workers)
     require(max_steps is None or max_steps >= 1, "max_steps", "null or at least 1", max_steps)
+    require(device in ("cpu", "cuda"), "device", "cpu or cuda", device)
+    require(
+        device == "cpu" or torch.cuda.is_available(), "device", "cpu, as torch finds no CUDA device", device
+    )
     config = run.config()
+    missing = [key for key in REQUIRED_KEYS if key not in flatten(config)]
+    if missing:
+        raise UserError(
+            f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
+        )
     weights = run.policy_weights(checkpoint)
+    if not weights.exists():
+        raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
     step = int(weights.parent.name.removeprefix("step-"))
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     count = physical_cores() if workers is None else workers
@@ -98,15 +122,18 @@ def evaluate(
                 first_seed=first_seed,
                 episodes=episodes,
                 max_steps=max_steps,
+                device=device,
             )
-            job = Job(build, run.path, step, number, noise_seed, max_steps)
-            with RolloutLog(run.rollouts(protocol.name), asdict(protocol), overwrite=overwrite) as rollouts:
+            job = Job(build, run.path, step, number, noise_seed, max_steps, device)
+            name = protocol.name(run.weight_steps()[-1])
+            with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=overwrite) as rollouts:
                 if rollouts.summary is None:
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
                     files = _record_some(job, rows, rollouts, run_all) if recordings else {}
                     (renderer,) = run_all(gl_renderer, [(job,)])
                     summary = {
                         **summarise(rows),
+                        "name": name,
                         "experiment": config["name"],
                         "nfe": number,
                         "checkpoint_step": step,

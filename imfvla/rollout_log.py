@@ -5,6 +5,7 @@ import json
 import logging
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -54,6 +55,7 @@ class RolloutLog:
         with clear_write_errors(self._partial):
             self._stream.write(dump_row(row))
             self._stream.flush()
+        self.rows.append(dict(row))
 
     def finish(self, rows: Iterable[Row], summary: Mapping[str, Any]) -> None:
         """Writes `episodes.jsonl` and `summary.json`, each whole or not at all, the summary last."""
@@ -69,6 +71,10 @@ class RolloutLog:
     ) -> None:
         if self._stream is not None:
             self._stream.close()
+            if not self.rows:  # nothing to go on from
+                self._partial.unlink()
+                with suppress(OSError):  # unless it holds an earlier evaluation
+                    self.path.rmdir()
         os.close(self._lock)
 
     def _finished(self) -> dict[str, Any] | None:

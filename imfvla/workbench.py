@@ -29,6 +29,7 @@ class Job:
     nfe: int
     noise_seed: int
     max_steps: int | None
+    device: str  # of the policy
 
 
 def load_workbench(run: Path, step: int) -> tuple[Any, Any]:
@@ -86,7 +87,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
     env, policy = _bench(job.build, job.run, job.step)
-    actor = ChunkActor(policy, policy.horizon, job.nfe, job.noise_seed)
+    actor = ChunkActor(policy.to(job.device), policy.horizon, job.nfe, job.noise_seed, job.device)
     config = RunDirectory(job.run).config() if sinks else {}
     metadata = {"policy": str(config.get("name", "")), "nfe": job.nfe, "checkpoint_step": job.step}
     threads = torch.get_num_threads()

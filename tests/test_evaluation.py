@@ -14,6 +14,7 @@ from imfvla.evaluation import best_median_worst, evaluate
 from imfvla.reporting.metrics import TIMING
 from imfvla.rollout_log import PARTIAL
 from imfvla.run_directory import RunDirectory
+from imfvla.training.checkpoint import load_policy
 
 NAME = "seeds100000-100005_nfe1"
 
@@ -25,7 +26,11 @@ def run(tmp_path: Path) -> RunDirectory:
     for step in (10, 20):
         run.weights_directory(step).mkdir(parents=True)
         (run.weights_directory(step) / "policy.safetensors").write_bytes(b"weights of step %d" % step)
-    config = {"name": "fake", "task": {"name": "fake", "variant": "default"}}
+    config = {
+        "name": "fake",
+        "task": {"name": "fake", "variant": "default"},
+        "observation": {"views": ["front"], "image_size": [16, 16]},
+    }
     (run.path / "config.yaml").write_text(yaml.safe_dump(config))
     return run
 
@@ -111,18 +116,12 @@ def test_a_finished_evaluation_is_left_alone_until_the_weights_change(run):
     assert again["protocol"]["weights"] != first["protocol"]["weights"]
 
 
-def test_rows_of_other_weights_are_not_mixed_in(run, monkeypatch):
-    def killed(*args, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(workbench, "run_episode", killed)
-    with pytest.raises(KeyboardInterrupt):
-        roll(run)
-    partial = run.rollouts(NAME) / PARTIAL
-    header = json.loads(partial.read_text())
-    header["protocol"]["weights"] = "0" * 16
-    partial.write_text(json.dumps(header) + '\n{"seed": 100000, "foreign": true}\n')
-    monkeypatch.undo()
+@pytest.mark.parametrize(
+    "left", ['{"protocol": {"weights": "0123"}}\n{"seed": 100000, "foreign": true}\n', "{damaged\n"]
+)
+def test_rows_of_other_weights_are_not_mixed_in(run, left):
+    run.rollouts(NAME).mkdir(parents=True)
+    (run.rollouts(NAME) / PARTIAL).write_text(left)
     roll(run)
     assert "foreign" not in (run.rollouts(NAME) / "episodes.jsonl").read_text()
 
@@ -173,6 +172,7 @@ def test_a_wrong_nfe_is_named(value):
         (["run={run}", "nfe=1,0"], "nfe must be one or more whole numbers"),
         (["run={run}", "episodes=0"], "episodes must be at least 1, found 0"),
         (["run={run}", "episodes=many"], "episodes must be a whole number, found 'many'"),
+        (["run={run}", "device=gpu"], "device must be cpu or cuda, found 'gpu'"),
         (["run={run}", "checkpoint=15"], "has no weights of step 15: kept are 10, 20, or take last"),
         (["run={run}", "episode=3"], "Unknown key episode (did you mean episodes?)"),
     ],
@@ -193,6 +193,31 @@ def test_a_run_without_weights_is_named(run):
     for path in run.checkpoints.glob("*"):
         path.rmdir()
     with pytest.raises(UserError, match="has no weights in checkpoints"):
+        roll(run)
+
+
+def test_other_weights_noise_and_lengths_have_folders_of_their_own(run):
+    (summary,) = roll(run, checkpoint=10, noise_seed=3, max_steps=5)
+    assert summary["name"] == "seeds100000-100005_nfe1_step10_noise3_max5"
+    assert summary["protocol"]["weights"] != roll(run)[0]["protocol"]["weights"]
+    assert sorted(path.name for path in run.path.glob("rollouts/*")) == [NAME, summary["name"]]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_weights_that_are_no_tensors_are_named_and_nothing_is_left_behind(run, workers):
+    with pytest.raises(UserError, match="lacks the key 'horizon'"):
+        evaluate(run, episodes=1, first_seed=0, nfe=[1], workers=workers, build=load_policy_alone)
+    assert not list(run.path.glob("rollouts/*"))
+
+
+def load_policy_alone(path: Path, step: int) -> tuple:
+    """A `workbench.Build` without a simulator, for a run whose config is no policy's."""
+    return None, load_policy(RunDirectory(path), step)
+
+
+def test_a_config_of_something_else_is_named(run):
+    (run.path / "config.yaml").write_text("name: other\ntask: {name: socket}\n")
+    with pytest.raises(UserError, match=r"lacks task\.variant, observation\.views, observation\.image_size"):
         roll(run)
 
 
