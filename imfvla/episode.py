@@ -76,7 +76,7 @@ class Actor(Protocol):
 
 
 class Sink(Protocol):
-    """Receives an episode as it happens: `begin`, `step` for each control step, then `end` or, after an exception, `abort`."""
+    """Receives an episode as it happens: `begin`, each `step`, then `end` or, after an exception, `abort`."""
 
     def begin(self, env: Any, info: EpisodeInfo) -> None: ...
     def step(self, env: Any, step: Step) -> None: ...
