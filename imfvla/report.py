@@ -25,9 +25,10 @@ def main(config: dict[str, Any]) -> None:
             "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
         )
     named = tables(collect(runs))
+    paths = write(named, Path(config["output"]))
     for table in named.values():
         table.print()
-    for path in write(named, Path(config["output"])):
+    for path in paths:
         print(path)
 
 

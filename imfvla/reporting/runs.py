@@ -66,13 +66,13 @@ def rows(run: RunDirectory) -> list[Evaluation]:
 
 
 def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
-    """Runs with a finished evaluation in or below the directories, by path."""
-    found = {
-        summary.parents[2]
-        for root in directories
-        for summary in Path(root).glob("**/rollouts/*/summary.json")
-    }
-    return [RunDirectory(path) for path in sorted(found) if (path / "config.yaml").exists()]
+    """Runs with a finished evaluation in or below the directories, in their order and by path within each."""
+    found: dict[Path, None] = {}
+    for root in directories:
+        found |= dict.fromkeys(
+            path.parents[2] for path in sorted(Path(root).glob("**/rollouts/*/summary.json"))
+        )
+    return [RunDirectory(path) for path in found if (path / "config.yaml").exists()]
 
 
 def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:

@@ -1,5 +1,6 @@
 """Tables 1 to 3 over many runs, ours beside the paper's: Markdown and CSV."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,25 +11,33 @@ from imfvla.reporting.table import NOTHING, Table
 from imfvla.reporting.table_row import COLUMNS, ours, printed
 from imfvla.run_directory import RunDirectory
 
-Ours = dict[tuple[str, int], Evaluation]  # experiment and nfe -> the run that stands for it
+Ours = dict[tuple[str, int], Evaluation]  # label and nfe -> the evaluation that stands for it
+log = logging.getLogger(__name__)
 
 
 def collect(runs: Sequence[RunDirectory]) -> Ours:
-    """The evaluation of each experiment and nfe; of several, one of the reporting band, else the last trained."""
+    """The evaluation of each experiment and nfe in the reporting band; of several runs, that of the last one."""
     found: Ours = {}
     for run in runs:
         for evaluation in rows(run):
-            key = (evaluation.summary["experiment"], evaluation.nfe)
-            if key not in found or _rank(evaluation) >= _rank(found[key]):
-                found[key] = evaluation
+            if not evaluation.is_reporting:
+                log.info("%s is left out: no whole episodes of the reporting band.", evaluation.folder)
+                continue
+            found[label(evaluation), evaluation.nfe] = evaluation
     return found
+
+
+def label(evaluation: Evaluation) -> str:
+    """The experiment, with the overrides in the run's name where it has any: such runs stand for no row of the paper."""
+    experiment, name = evaluation.summary["experiment"], evaluation.run.resolve().name
+    return experiment if name in ("default", experiment) else f"{experiment}/{name}"
 
 
 def tables(found: Ours) -> dict[str, Table]:
     """File stem -> table: the paper's three, and the rows of ours that the paper does not have."""
     named = {f"table{number}": _paper_table(number, found) for number in (1, 2)}
     named["table3"] = _comparison_table(found)
-    others = {key: evaluation for key, evaluation in found.items() if evaluation.paper is None}
+    others = {key: evaluation for key, evaluation in found.items() if paper_row(*key) is None}
     if others:
         cells = tuple(
             (experiment, str(nfe), "ours", *ours(evaluation.summary))
@@ -54,10 +63,6 @@ def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
     return _result(comparison.operation, value, against)
 
 
-def _rank(evaluation: Evaluation) -> tuple[bool, float]:
-    return evaluation.is_reporting, (evaluation.folder / "summary.json").stat().st_mtime
-
-
 def _paper_table(number: int, found: Ours) -> Table:
     cells = []
     for row in paper_rows():
@@ -77,7 +82,7 @@ def _comparison_table(found: Ours) -> Table:
         row = found.get((comparison.experiment, comparison.nfe))
         baseline = found.get((comparison.baseline, comparison.baseline_nfe))
         result = NOTHING
-        if row and baseline:
+        if row and baseline and row.summary["episodes"] == baseline.summary["episodes"]:
             key = {
                 "avg_reward": "avg_return",
                 "success": "success_episodes",

@@ -107,6 +107,26 @@ def test_tables_of_all_runs(run, tmp_path):
     assert all(path.stat().st_size > 0 for path in paths)
 
 
+def test_runs_with_overrides_and_other_seeds_stand_for_no_row_of_the_paper(run, tmp_path):
+    varied = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "core=standard")
+    write_evaluation(varied, 1, gain=9)
+    selection = make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
+    write_evaluation(selection, 1, first_seed=10_000)
+    found = collect(find_runs([tmp_path]))
+    assert sorted(found) == [
+        ("socket_ph32_exec16", 1), ("socket_ph32_exec16", 4), ("socket_ph32_exec16/core=standard", 1),
+    ]  # fmt: skip
+    assert len(tables(found)["table1"].rows) == 7 + 1
+
+
+def test_of_two_runs_of_an_experiment_the_later_directory_stands(run, tmp_path):
+    shipped = make_run(tmp_path / "pretrained" / "socket_ph32_exec16")
+    write_evaluation(shipped, 1, gain=2)
+    for order, reward in (("runs", "pretrained"), 3000), (("pretrained", "runs"), 1500):
+        found = collect(find_runs(tmp_path / name for name in order))
+        assert found["socket_ph32_exec16", 1].summary["avg_return"] == reward
+
+
 def test_a_broken_or_incomplete_summary_is_named(run):
     path = next(run.glob("rollouts/*_nfe1_*/summary.json"))
     path.write_text("{")
