@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imfvla.files import write_text
-from imfvla.reporting.paper import TITLES, Comparison, PaperRow, comparisons, paper_rows
+from imfvla.reporting.paper import TITLES, Comparison, PaperRow, comparisons, paper_row, paper_rows
 from imfvla.reporting.runs import Evaluation, rows
 from imfvla.reporting.table import NOTHING, Table
 from imfvla.reporting.table_row import COLUMNS, ours, printed
@@ -28,7 +28,7 @@ def collect(runs: Sequence[RunDirectory]) -> Ours:
 
 
 def label(evaluation: Evaluation) -> str:
-    """The experiment, with the overrides in the run's name where it has any: such runs stand for no row of the paper."""
+    """The experiment, with the overrides in the run's name if any: such runs stand for no row of the paper."""
     experiment, name = evaluation.summary["experiment"], evaluation.run.resolve().name
     return experiment if name in ("default", experiment) else f"{experiment}/{name}"
 
