@@ -1,4 +1,4 @@
-"""Demonstrations: episodes of the scripted expert, one MCAP file each, recorded on all cores. Needs no torch to record."""
+"""Demonstrations: episodes of the scripted expert, one MCAP file each, recorded on all cores."""
 
 import json
 import os
@@ -33,9 +33,13 @@ class DemoOptions:
 
     def __post_init__(self) -> None:
         require(self.episodes >= 1, "demos.episodes", "at least 1", self.episodes)
-        require(0 <= self.first_seed < SEED_LIMIT, "demos.first_seed", f"in 0...{SEED_LIMIT - 1}", self.first_seed)
+        require(
+            0 <= self.first_seed < SEED_LIMIT, "demos.first_seed", f"in 0...{SEED_LIMIT - 1}", self.first_seed
+        )
         require(self.camera_every >= 1, "demos.camera_every", "at least 1", self.camera_every)
-        require(self.workers is None or self.workers >= 0, "demos.workers", "null or at least 0", self.workers)
+        require(
+            self.workers is None or self.workers >= 0, "demos.workers", "null or at least 0", self.workers
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,4 +250,3 @@ def _link_folder(directory: Path, seeds: list[int], options: DemoOptions) -> Pat
             (folder / name).unlink(missing_ok=True)
             os.symlink(Path("..") / directory.name / name, folder / name)
     return folder
-

@@ -23,12 +23,16 @@ def select_gl_backend() -> str:
     """
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted and wanted not in BACKENDS:
-        raise UserError(f"MUJOCO_GL must be one of {', '.join(BACKENDS)}, found {wanted!r}; unset it or mend it.")
+        raise UserError(
+            f"MUJOCO_GL must be one of {', '.join(BACKENDS)}, found {wanted!r}; unset it or mend it."
+        )
     if wanted in _PROBES and not _PROBES[wanted]():
         raise UserError(f"MUJOCO_GL={wanted} was asked for, but {wanted} cannot be loaded here; {_REMEDY}.")
     backend = wanted or next((name for name, probe in _PROBES.items() if probe()), None)
     if backend is None:
-        raise UserError(f"MuJoCo needs EGL or OSMesa to render the cameras, but neither can be loaded; {_REMEDY}.")
+        raise UserError(
+            f"MuJoCo needs EGL or OSMesa to render the cameras, but neither can be loaded; {_REMEDY}."
+        )
     os.environ["MUJOCO_GL"] = backend
     if backend in _PROBES:
         os.environ["PYOPENGL_PLATFORM"] = backend
@@ -46,9 +50,9 @@ def _has_egl() -> bool:
     address = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
     if not address:
         return False
-    query = ctypes.CFUNCTYPE(
-        ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int)
-    )(address)
+    query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))(
+        address
+    )
     count = ctypes.c_int(0)
     return bool(query(0, None, ctypes.byref(count))) and count.value > 0
 

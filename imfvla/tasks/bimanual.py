@@ -296,4 +296,6 @@ class BimanualEnvironment(composer.Environment):
 def _check_views(views: tuple[str, ...]) -> None:
     for view in views:
         if view not in CAMERAS:
-            raise UserError(f"There is no view {view!r}; choose from {', '.join(CAMERAS)} in observation.views.")
+            raise UserError(
+                f"There is no view {view!r}; choose from {', '.join(CAMERAS)} in observation.views."
+            )

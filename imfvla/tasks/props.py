@@ -39,7 +39,9 @@ class Prop(composer.Entity):
         self._root = mjcf.RootElement(model=name)
         self._root.compiler.angle = "radian"
 
-    def _box(self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...], **more) -> None:
+    def _box(
+        self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...], **more
+    ) -> None:
         self._root.worldbody.add("geom", name=name, pos=pos, size=half, rgba=rgba, **_SOLID, **more)
 
     def _paint(self, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
@@ -85,10 +87,10 @@ class Socket(Prop):
         tab = (-RING_THICKNESS - TAB_LENGTH / 2, 0, TAB_HEIGHT / 2 - half)
         self._box("tab", tab, (TAB_LENGTH / 2, TAB_WIDTH / 2, TAB_HEIGHT / 2), BLUE)
         reach, thickness = FLARE / np.sqrt(2), 0.0015
-        width = aperture / 2 + reach / 2
+        width, ahead = aperture / 2 + reach / 2, np.array([1, 0, 0])
         for side, turn in (("above", (0, -1)), ("below", (0, 1)), ("left", (1, 0)), ("right", (-1, 0))):
             out = np.array([0, turn[0], -turn[1]])  # the lip leans 45 degrees to this side
-            pos = out * (aperture / 2) + reach / 2 * (out + [1, 0, 0]) + thickness / np.sqrt(2) * (out - [1, 0, 0])
+            pos = out * (aperture / 2) + reach / 2 * (out + ahead) + thickness / np.sqrt(2) * (out - ahead)
             half = (FLARE / 2, thickness, width) if turn[0] else (FLARE / 2, width, thickness)
             self._box(f"lip_{side}", pos, half, MAGENTA, euler=(0, turn[1] * np.pi / 4, turn[0] * np.pi / 4))
         self.tab_centre = tab

@@ -17,8 +17,8 @@ FINGER_TRAVEL = 0.045  # of each finger; the opening is twice that
 FINGER_LENGTH = 0.08
 FINGERTIP = 0.006  # how far the fingers reach beyond the grip point
 JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
-# Motors are heavy for their damping on purpose: the contact solver knows inertia but not damping, and where damping times
-# the time step exceeds the inertia its forces are wrong, so that held things jump.
+# Motors are heavy for their damping on purpose: the contact solver knows inertia but not damping, and where damping
+# times the time step exceeds the inertia its forces are wrong, so that held things jump.
 STIFFNESS = (2500.0, 2500.0, 1500.0, 1500.0, 400.0, 400.0, 200.0)  # [N m / rad]
 ARMATURE = (1.0, 1.0, 0.7, 0.7, 0.2, 0.2, 0.15)  # [kg m^2]
 LAG_S = 0.04  # damping over stiffness: joints follow their targets nearly like a first-order filter
@@ -63,19 +63,45 @@ class Arm(composer.Entity):
         body = self._root.worldbody
         body.add("geom", type="cylinder", size=[0.07, 0.05], pos=[0, 0, 0.05], rgba=_DARK, mass=1)
         link = self._link(body, 1, [0, 0, SHOULDER_HEIGHT], "z")
-        link.add("geom", type="capsule", size=[0.055], fromto=[0, 0, -0.08, 0, 0, 0], rgba=_LIGHT[side], mass=2)
+        link.add(
+            "geom", type="capsule", size=[0.055], fromto=[0, 0, -0.08, 0, 0, 0], rgba=_LIGHT[side], mass=2
+        )
         link = self._link(link, 2, [0, 0, 0], "y")
         link.add(
-            "geom", type="capsule", size=[0.045], fromto=[0, 0, 0, 0, 0, UPPER_ARM / 2], rgba=_LIGHT[side], mass=1.5
+            "geom",
+            type="capsule",
+            size=[0.045],
+            fromto=[0, 0, 0, 0, 0, UPPER_ARM / 2],
+            rgba=_LIGHT[side],
+            mass=1.5,
         )
         link = self._link(link, 3, [0, 0, UPPER_ARM / 2], "z")
         link.add(
-            "geom", type="capsule", size=[0.042], fromto=[0, 0, 0, 0, 0, UPPER_ARM / 2], rgba=_LIGHT[side], mass=1
+            "geom",
+            type="capsule",
+            size=[0.042],
+            fromto=[0, 0, 0, 0, 0, UPPER_ARM / 2],
+            rgba=_LIGHT[side],
+            mass=1,
         )
         link = self._link(link, 4, [0, 0, UPPER_ARM / 2], "y")
-        link.add("geom", type="capsule", size=[0.04], fromto=[0, 0, 0, 0, 0, FOREARM / 2], rgba=_LIGHT[side], mass=1)
+        link.add(
+            "geom",
+            type="capsule",
+            size=[0.04],
+            fromto=[0, 0, 0, 0, 0, FOREARM / 2],
+            rgba=_LIGHT[side],
+            mass=1,
+        )
         link = self._link(link, 5, [0, 0, FOREARM / 2], "z")
-        link.add("geom", type="capsule", size=[0.036], fromto=[0, 0, 0, 0, 0, FOREARM / 2], rgba=_LIGHT[side], mass=0.7)
+        link.add(
+            "geom",
+            type="capsule",
+            size=[0.036],
+            fromto=[0, 0, 0, 0, 0, FOREARM / 2],
+            rgba=_LIGHT[side],
+            mass=0.7,
+        )
         link = self._link(link, 6, [0, 0, FOREARM / 2], "y")
         link.add("geom", type="capsule", size=[0.034], fromto=[0, 0, 0, 0, 0, 0.04], rgba=_DARK, mass=0.4)
         self._add_camera(link)
@@ -152,7 +178,9 @@ class Arm(composer.Entity):
         hand.add("site", name="grip", pos=[0, 0, tip], quat=quat, size=[0.003], rgba=[0, 0, 0, 0])
         joints = []
         for name, sign in (("a", 1), ("b", -1)):
-            finger = hand.add("body", name=f"finger_{name}", pos=[sign * 0.006, 0, tip + FINGERTIP], gravcomp=1)
+            finger = hand.add(
+                "body", name=f"finger_{name}", pos=[sign * 0.006, 0, tip + FINGERTIP], gravcomp=1
+            )
             joints.append(
                 finger.add(
                     "joint", name=f"finger_{name}", type="slide", axis=[sign, 0, 0], limited=True,

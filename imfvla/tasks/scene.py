@@ -7,11 +7,16 @@ from imfvla.tasks.robot import TABLE_BIT, Arm, look_at
 
 PHYSICS_TIMESTEP_S = 0.004
 BASE_X = 0.62  # the arms' bases stand at -x (left) and +x (right) and face each other
-CAMERAS = {"front": "front", "top": "top", "r_wrist": "right/wrist", "l_wrist": "left/wrist"}  # view -> MJCF name
+CAMERAS = {
+    "front": "front",
+    "top": "top",
+    "r_wrist": "right/wrist",
+    "l_wrist": "left/wrist",
+}  # view -> MJCF name
 
 
 class Scene(composer.Arena):
-    """One table with two arms. World frame: x from left to right, y away from the front camera, z up, table top at 0."""
+    """One table with two arms. World: x from left to right, y away from the front camera, z up, table top at 0."""
 
     def _build(self) -> None:
         super()._build(name="scene")

@@ -11,7 +11,10 @@ from imfvla.tasks.props import BAR_WIDTH, RING_THICKNESS, Bar, Socket
 PEG_LENGTH = 0.17
 APERTURE = {"easy": 0.036, "default": 0.032, "hard": 0.028}
 RANGES = {  # the socket's frame is its mouth, some 5 cm towards the middle of the table from its centre
-    "easy": (StartRange((-0.18, -0.14), (-0.02, 0.02), (-0.1, 0.1)), StartRange((0.16, 0.20), (-0.02, 0.02), (-0.1, 0.1))),
+    "easy": (
+        StartRange((-0.18, -0.14), (-0.02, 0.02), (-0.1, 0.1)),
+        StartRange((0.16, 0.20), (-0.02, 0.02), (-0.1, 0.1)),
+    ),
     "default": (
         StartRange((-0.26, -0.06), (-0.125, 0.125), (-0.55, 0.55)),
         StartRange((0.08, 0.28), (-0.125, 0.125), (-0.55, 0.55)),
@@ -20,16 +23,20 @@ RANGES = {  # the socket's frame is its mouth, some 5 cm towards the middle of t
         StartRange((-0.28, -0.06), (-0.15, 0.15), (-0.7, 0.7)),
         StartRange((0.08, 0.30), (-0.15, 0.15), (-0.7, 0.7)),
     ),
-}  # fmt: skip
+}
 LIFTED = 0.03  # above the resting height
-AT_MOUTH, AT_MOUTH_ASIDE, AT_MOUTH_ANGLE = 0.03, 0.015, 0.25  # stage 3: distance along and aside the axis, tilt [rad]
+AT_MOUTH, AT_MOUTH_ASIDE, AT_MOUTH_ANGLE = (
+    0.03,
+    0.015,
+    0.25,
+)  # stage 3: distance along and aside the axis, tilt [rad]
 INSIDE, INSIDE_ANGLE = 0.005, 0.12  # stage 4
 SEATED = RING_THICKNESS - 0.002  # stage 5: depth at which the tip is through the ring
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How the peg lies in the socket: depth of its nearer tip along the hole [m], that tip's offset (2,) [m], tilt [rad]."""
+    """How the peg lies to the socket: depth of its tip along the hole [m], that tip's offset (2,) [m], tilt [rad]."""
 
     depth: float
     aside: np.ndarray
@@ -43,7 +50,9 @@ class SocketTask(BimanualTask):
     num_stages = 5
 
     def __init__(self, variant: str) -> None:
-        super().__init__(variant, {"socket": Socket("socket", APERTURE[variant]), "peg": Bar("peg", PEG_LENGTH)})
+        super().__init__(
+            variant, {"socket": Socket("socket", APERTURE[variant]), "peg": Bar("peg", PEG_LENGTH)}
+        )
         self.ranges = dict(zip(("socket", "peg"), RANGES[variant], strict=True))
 
     def fit(self, physics: mjcf.Physics) -> Fit:

@@ -15,7 +15,7 @@ LIFTED = 0.03  # above the resting height
 
 
 class TransferTask(BimanualTask):
-    """Stages: 1 the right gripper holds the bar, 2 lifted, 3 the left one holds it too, 4 the left one alone, in the air."""
+    """Stages: 1 right gripper holds the bar, 2 lifted, 3 left one holds it too, 4 left one alone, in the air."""
 
     name = "transfer"
     num_stages = 4

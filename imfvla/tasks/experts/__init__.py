@@ -11,5 +11,7 @@ _EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert}
 def make_expert(name: str, *, modes: int, noise: float) -> Expert:
     """The expert of the task `name`; see `Expert` for `modes` and `noise` [rad]. UserError on an unknown name."""
     if name not in _EXPERTS:
-        raise UserError(f"There is no expert for a task {name!r}; choose one of {', '.join(sorted(_EXPERTS))}.")
+        raise UserError(
+            f"There is no expert for a task {name!r}; choose one of {', '.join(sorted(_EXPERTS))}."
+        )
     return _EXPERTS[name](modes=modes, noise=noise)

@@ -1,8 +1,8 @@
 """What the scripted experts share: style drawn from the seed, one controlled hand per arm, action noise.
 
-An expert decides from the measured state alone, not from a clock, so that a policy that sees one frame can learn it. Each
-hand is pulled towards a goal by a carrot: the commanded pose lies ahead of the measured one by at most the distance that
-is covered within the arm's lag. Drift and noise are thereby corrected in the recorded actions.
+An expert decides from the measured state alone, not from a clock, so that a policy that sees one frame can learn it.
+Each hand is pulled towards a goal by a carrot: the commanded pose lies ahead of the measured one by at most the
+distance that is covered within the arm's lag. Drift and noise are thereby corrected in the recorded actions.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,10 @@ SPEED, TURN_SPEED = 0.125, 2.0  # m/s, rad/s
 GRASP_HEIGHT = 0.014  # of the point between the fingertips above the table
 HELD_OPENING = 0.33  # a gripper around a bar measures 0.27
 NOISE_CORRELATION = 0.9  # of the action noise from one control step to the next
-FREE_DISTANCE, LEAST_FREEDOM = 0.08, 0.2  # full noise this far [m] from the goal, this share of it at the goal
+FREE_DISTANCE, LEAST_FREEDOM = (
+    0.08,
+    0.2,
+)  # full noise this far [m] from the goal, this share of it at the goal
 HOLD_STEPS = 18  # after success, before a demonstration ends
 _STYLE_STREAM, _NOISE_STREAM = 11, 12
 _ARM = {"left": slice(0, 7), "right": slice(8, 15)}
@@ -94,7 +97,9 @@ class Expert:
         self.task = task
         self.hands = {side: Hand(task, side, ArmKinematics(env.physics.model.ptr, side)) for side in SIDES}
         rng = np.random.default_rng(np.random.SeedSequence([seed, _STYLE_STREAM]))
-        signs = rng.choice([-1, 1], size=2)  # always drawn, so that the rest of the style is the same in all modes
+        signs = rng.choice(
+            [-1, 1], size=2
+        )  # always drawn, so that the rest of the style is the same in all modes
         self.turn = {  # the hidden mode: which of its two equivalent yaws each gripper takes
             "left": float(signs[0]) if self.modes == 4 else 1.0,
             "right": float(signs[1]) if self.modes >= 2 else 1.0,
@@ -153,7 +158,7 @@ class Expert:
         aside = np.linalg.norm(goal.position[:2] - hand.pose.position[:2])
         turn = np.linalg.norm(rotation_vector(goal.rotation @ hand.pose.rotation.T))
         away = max(aside / 0.02, turn / 0.25) - 0.3
-        above = Pose(goal.position + [0, 0, self.height * np.clip(away, 0, 1)], goal.rotation)
+        above = Pose(goal.position + np.array([0, 0, self.height * np.clip(away, 0, 1)]), goal.rotation)
         ready = hand.is_at(goal, 0.007, 0.08) or (hand.opening < 0.6 and hand.is_at(goal, 0.02, 0.3))
         hand.move(above, 0.0 if ready else 1.0, self.speed)
         return goal

@@ -40,14 +40,14 @@ class SocketExpert(Expert):
             goal = self.lift(socket, meeting, self.task.props["socket"].rest_height)
             left.move(left.carry(socket, goal), 0.0, self.speed)
         else:
-            self.pick(left, socket, np.array(self.task.props["socket"].tab_centre) + [self.tab_offset, 0, 0])
+            self.pick(left, socket, self.task.props["socket"].tab_centre + np.array([self.tab_offset, 0, 0]))
 
         if right.closed and self.task.holds(contacts, "right", "peg"):
             waiting = np.linalg.norm(socket.position - meeting.position) < 0.02
             if has_socket and waiting and np.linalg.norm(rotation_vector(socket.rotation)) < 0.12:
                 self._insert(socket, peg)
             else:
-                goal = Pose(self.meeting + [PEG_LENGTH / 2 - STANDOFF, 0, 0], np.eye(3))
+                goal = Pose(self.meeting + np.array([PEG_LENGTH / 2 - STANDOFF, 0, 0]), np.eye(3))
                 goal = self.lift(peg, goal, self.task.props["peg"].rest_height)
                 right.move(right.carry(peg, goal), 0.0, self.speed)
         else:

@@ -29,7 +29,9 @@ class TransferExpert(Expert):
     def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
         left, right = self.hands["left"], self.hands["right"]
         bar = self.task.prop_pose(env.physics, "bar")
-        if abs(rotation_vector(bar.rotation)[2]) > np.pi / 2:  # half a turn changes nothing about a symmetric bar
+        if (
+            abs(rotation_vector(bar.rotation)[2]) > np.pi / 2
+        ):  # half a turn changes nothing about a symmetric bar
             bar = Pose(bar.position, bar.rotation @ about_z(np.pi))
         meeting = Pose(self.meeting, np.eye(3))
         rest_height = self.task.props["bar"].rest_height
@@ -42,7 +44,9 @@ class TransferExpert(Expert):
             and np.linalg.norm(bar.position - meeting.position) < 0.015
             and np.linalg.norm(rotation_vector(bar.rotation)) < 0.1
         )
-        take = Pose(bar.at(np.array([self.take_at, 0, 0])), bar.rotation @ about_z(self.turn["left"] * np.pi / 2))
+        take = Pose(
+            bar.at(np.array([self.take_at, 0, 0])), bar.rotation @ about_z(self.turn["left"] * np.pi / 2)
+        )
 
         if right_has and not left_has:
             goal = self.lift(bar, meeting, rest_height)
@@ -61,9 +65,9 @@ class TransferExpert(Expert):
             aside = np.linalg.norm((take.position - left.pose.position)[:2])
             turn = np.linalg.norm(rotation_vector(take.rotation @ left.pose.rotation.T))
             away = np.clip(max(aside / 0.02, turn / 0.25) - 0.3, 0, 1)
-            goal = Pose(take.position + [0, 0, ABOVE * away], take.rotation)
+            goal = Pose(take.position + np.array([0, 0, ABOVE * away]), take.rotation)
             ready = left.is_at(take, 0.008, 0.08) or (left.opening < 0.6 and left.is_at(take, 0.02, 0.3))
             left.move(goal, 0.0 if ready else 1.0, TAKE_SPEED)
         else:
             rotation = about_z(self.turn["left"] * np.pi / 2)
-            left.move(Pose(self.meeting + [self.take_at, 0, ABOVE], rotation), 1.0, self.speed)
+            left.move(Pose(self.meeting + np.array([self.take_at, 0, ABOVE]), rotation), 1.0, self.speed)

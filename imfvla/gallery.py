@@ -1,0 +1,91 @@
+"""python -m imfvla.gallery task=socket: a contact sheet of every view, for both ways of the hidden choice."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imfvla.entry import entry_point
+from imfvla.options import require
+
+MARGIN = 6  # px between pictures
+
+
+@entry_point("gallery")
+def main(config: dict[str, Any]) -> None:
+    require(
+        isinstance(config["seed"], int) and config["seed"] >= 0,
+        "seed",
+        "a whole number of at least 0",
+        config["seed"],
+    )
+    require(
+        isinstance(config["size"], int) and 16 <= config["size"] <= 960, "size", "in 16...960", config["size"]
+    )
+    for path in write_gallery(config["task"], config["seed"], config["size"], Path(config["directory"])):
+        print(path)
+
+
+def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path) -> list[Path]:
+    """Writes one PNG for each way the right gripper can turn, from the same start state; returns their paths.
+
+    Columns are the views, rows the moments of the episode: start, a quarter, middle and end.
+    """
+    import cv2  # with tasks, here: a slip in the config is told at once
+
+    from imfvla import tasks
+
+    env = tasks.load(task["name"], variant=task["variant"])
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = []
+    seed, experts = _both_ways(env, task, seed)
+    for label, expert in experts.items():
+        frames = _play(env, expert, seed, size)
+        chosen = [frames[round(share * (len(frames) - 1))] for share in (0, 0.25, 0.5, 1)]
+        path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
+        cv2.imwrite(str(path), _sheet(chosen)[:, :, ::-1])
+        paths.append(path)
+    env.close()
+    return paths
+
+
+def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[str, Any]]:
+    """A seed whose hidden draw differs from the unimodal expert's choice, and both experts."""
+    from imfvla.tasks.experts import make_expert
+
+    noise = task["expert"]["noise"]
+    usual, other = (make_expert(task["name"], modes=modes, noise=noise) for modes in (1, 2))
+    while True:
+        env.reset(seed)
+        usual.reset(env, seed)
+        other.reset(env, seed)
+        if usual.style["turn_right"] != other.style["turn_right"]:
+            return seed, {"turn-plus": usual, "turn-minus": other}
+        seed += 1
+
+
+def _play(env: Any, expert: Any, seed: int, size: int, every: int = 10) -> list[list[np.ndarray]]:
+    """Pictures of all views every few steps of an episode, of its first and last state among them."""
+    env.reset(seed)
+    expert.reset(env, seed)
+    frames = []
+    for step in range(env.time_limit_steps):
+        if step % every == 0:
+            frames.append([env.render(view, size, size) for view in env.all_views])
+        env.step(expert.act(env, env.state(), step).executed)
+        if expert.done(env):
+            break
+    frames.append([env.render(view, size, size) for view in env.all_views])
+    return frames
+
+
+def _sheet(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """The pictures as one, with white margins."""
+    pad = ((MARGIN, 0), (MARGIN, 0), (0, 0))
+    lines = [np.concatenate([np.pad(p, pad, constant_values=255) for p in row], axis=1) for row in rows]
+    return np.concatenate(lines)
+
+
+if __name__ == "__main__":
+    main()
