@@ -211,6 +211,7 @@ class BimanualEnvironment(composer.Environment):
             time_limit=(TIME_LIMIT_STEPS - 0.1) / CONTROL_HZ,  # a margin for the sum of 3500 time steps
             random_state=0,
             recompile_mjcf_every_episode=False,
+            raise_exception_on_physics_error=False,  # a world that flies apart ends the episode, early and warned of
             strip_singleton_obs_buffer_dim=True,
         )
         self._mjcf_never_compiled = False  # the constructor has compiled it; nothing is drawn into the model

@@ -147,6 +147,15 @@ def test_the_700th_step_is_the_last(env):
     assert types[-1] is dm_env.StepType.LAST
 
 
+def test_a_world_that_flies_apart_ends_the_episode_early(env):
+    env.reset(0)
+    env.physics.data.qvel[:] = 1e12
+    timestep = env.step(env.action_spec().maximum)
+    assert timestep.last()
+    assert timestep.reward == 0
+    assert np.isfinite(env.reset(0).observation["state"]).all()
+
+
 @pytest.mark.parametrize("action", [np.full(16, np.nan), np.r_[np.inf, np.zeros(15)], np.zeros(15)])
 def test_a_bad_action_is_refused(env, action):
     env.reset(0)
