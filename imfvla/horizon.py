@@ -36,7 +36,7 @@ class Horizon:
         return np.maximum(np.arange(step - self.obs + 1, step + 1), 0)
 
     def action_steps(self, step: int, episode_length: int) -> tuple[np.ndarray, np.ndarray]:
-        """Steps of the chunk decided at `step`: int64 (pred,), the last repeated past the end, and bool (pred,) valid."""
+        """Steps of the chunk decided at `step`: int64 (pred,), the last repeated past the end; bool (pred,) valid."""
         steps = np.arange(step, step + self.pred)
         return np.minimum(steps, episode_length - 1), steps < episode_length
 
