@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from imfvla.composition import compose
+from imfvla.policy import build_policy
+
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
 
@@ -39,6 +42,15 @@ def test_the_makefile_documents_every_target():
         assert re.search(rf"^  {target} +\S", printed, re.MULTILINE), target
 
 
+def commands_in(documents: list[Path]) -> list[str]:
+    """Entry and arguments of every `python -m imfvla.<entry> ...` whose line holds nothing to fill in."""
+    text = "\n".join(document.read_text() for document in documents)
+    found = re.findall(
+        r"^ *(?:\.venv/bin/)?python -m imfvla\.(\w+ [^#\n<>]+)$", re.sub(r" +#.*", "", text), re.MULTILINE
+    )
+    return sorted(set(found))
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_documents_name_only_what_exists(document):
     text = document.read_text()
@@ -51,6 +63,18 @@ def test_documents_name_only_what_exists(document):
         assert target in make_targets(), target
     for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
         assert (document.parent / link).exists(), link
+
+
+@pytest.mark.parametrize("command", commands_in(DOCUMENTS))
+def test_commands_in_documents_compose_and_build(command):
+    entry, *arguments = command.split()
+    overrides = [
+        re.sub(r"^(?!nfe=)([^=]+=[^,]+),.*$", r"\1", text) for text in arguments if "=" in text
+    ]  # of a sweep
+    overrides = [re.sub(r"^nfe=(.*)$", r"nfe=[\1]", text) for text in overrides]
+    config = compose(entry, overrides)
+    if entry == "train":
+        build_policy(config)
 
 
 # What a package may import of imfvla beside itself and `errors`, and which of the heavy packages.
