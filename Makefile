@@ -46,7 +46,8 @@ tables: setup  ## Make the paper's tables from the run directories
 	$(PY) -m imfvla.report $(ARGS)
 
 gallery: setup  ## Write pictures of every view of both tasks
-	$(PY) -m imfvla.gallery $(ARGS)
+	$(PY) -m imfvla.gallery task=socket $(ARGS)
+	$(PY) -m imfvla.gallery task=transfer $(ARGS)
 
 test: setup  ## Run the tests on two processes (ARGS="tests/tasks -k seed")
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 $(ARGS)

@@ -18,7 +18,9 @@ class Observation:
     instruction: Tensor  # int64   (B, L)  word ids, 0 is padding
 
     def to(self, device: torch.device | str) -> "Observation":
-        return Observation(*(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)))
+        return Observation(
+            *(getattr(self, field.name).to(device, non_blocking=True) for field in fields(self))
+        )
 
 
 @dataclass(frozen=True, slots=True)
