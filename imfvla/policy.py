@@ -70,10 +70,13 @@ def build_policy(config: Mapping[str, Any], statistics: Any | None = None) -> Po
         raise UserError(
             f"the configuration lacks the key {error.args[0]!r} that a policy is built from."
         ) from None
-    except Exception as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"the configured policy cannot be built: {error}") from error
+    except UserError:
+        raise
+    except Exception as error:  # hydra wraps what a constructor raises
+        reason = error.__cause__ or error
+        if isinstance(reason, UserError):
+            raise reason from None
+        raise UserError(f"the configured policy cannot be built: {reason}") from error
     if statistics is not None:
         policy.encoder.state_normaliser.fit(
             torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max)

@@ -135,6 +135,12 @@ def test_parts_that_do_not_fit_are_refused_in_one_sentence():
     odd["core"] = odd["core"] | {"patch": 3}
     with pytest.raises(UserError, match=r"core\.patch must divide the 8 steps of horizon\.pred"):
         build_policy(odd)
+    odd["core"] = config()["core"]
+    odd["generator"] = odd["generator"] | {"compound_draws": 3}
+    with pytest.raises(
+        UserError, match=r"^generator\.compound_draws must lie between 1 and generator\.draws=2, found 3\.$"
+    ):
+        build_policy(odd)
     with pytest.raises(UserError, match=r"exec must not exceed horizon\.pred"):
         build_policy(config(horizon={"obs": 1, "pred": 8, "exec": 9}))
     lacking = config()

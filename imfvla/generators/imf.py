@@ -122,7 +122,7 @@ class ImprovedMeanFlow:
         z, r, t, context, valid = z[some], r[some], t[some], context.rows(some), valid[some]
         v_fixed = v.detach()[some]
         u = self.velocity(core, z, r, t, context)
-        _, dudt = self.derivative(core, z, r, t, v_fixed, context.detach())
+        _, dudt = self.derivative(core, z, r, t, v_fixed, context.detach(z.dtype))
         change = (t - r)[:, None, None] * dudt
         compound_target = target[some] if self.compound_target == "sample" else v_fixed
         compound_error = t**self.time_power * masked_error(u + change - compound_target, valid)

@@ -35,8 +35,9 @@ class Conditioning:
             return self
         return self.map(lambda x: x.repeat_interleave(times, dim=0))
 
-    def detach(self) -> "Conditioning":
-        return self.map(torch.detach)
+    def detach(self, dtype: torch.dtype) -> "Conditioning":
+        """Without gradient, in the precision `dtype` in which a derivative is taken."""
+        return self.map(lambda x: x.detach().to(dtype))
 
     def rows(self, index: Tensor | slice) -> "Conditioning":
         return self.map(lambda x: x[index])

@@ -91,6 +91,19 @@ def test_cached_context_equals_one_joint_pass(residual):
     torch.testing.assert_close(many[1::2], one)
 
 
+def test_the_derivative_is_taken_in_full_precision_under_autocast():
+    core = make_core("attnres-sum", dtype=torch.float32)
+    x, t, r, context = inputs(dtype=torch.float32)
+    conditioning = core.condition(context).detach(torch.float32)
+
+    def derivative():
+        return jvp(lambda x, t: core(x, t, r, conditioning), (x, t), (x, torch.ones_like(t)))[1]
+
+    exact = derivative()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(derivative(), exact)
+
+
 def test_every_parameter_learns():
     core = make_core("attnres-attn")
     x, t, r, context = inputs()

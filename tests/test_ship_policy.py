@@ -1,0 +1,94 @@
+"""A finished run becomes a small directory that says what made it."""
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+import yaml
+
+from imfvla.errors import UserError
+from imfvla.files import write_json
+from imfvla.reporting.metrics import summarise
+from imfvla.run_directory import DONE, RUNNING, RunDirectory
+
+TOOL = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "ship_policy.py"))
+EPISODE = {
+    "total_reward": 900.0,
+    "num_steps": 700,
+    "max_reward": 5.0,
+    "success": True,
+    "failure": None,
+    "timing": {"wall_s": 2.0, "inference_ms": [4.0]},
+}
+
+
+def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int = 10) -> RunDirectory:
+    run = RunDirectory(path)
+    write_json(run.path / "status.json", {"state": state})
+    (run.path / "config.yaml").write_text(yaml.safe_dump({"name": "socket_ph32_exec16", "seed": 3}))
+    for step in (10, 20):
+        weights = run.weights_directory(step) / "policy.safetensors"
+        write_json(weights.with_suffix(".json"), {"step": step, "train_s": 60.0, "code": "abc"})
+        weights.write_bytes(bytes(size))
+    run.last_state.parent.mkdir()
+    run.last_state.write_bytes(b"optimiser")
+    run.metrics.write_text("".join(f'{{"step": {step}}}\n' for step in range(1, 31)))
+    folder = run.rollouts("reported")
+    folder.mkdir(parents=True)
+    (folder / "episodes.jsonl").write_text(json.dumps(EPISODE) + "\n")
+    (folder / "median.mcap").write_bytes(b"large")
+    write_json(
+        folder / "summary.json",
+        summarise([EPISODE])
+        | {
+            "experiment": "socket_ph32_exec16",
+            "nfe": 1,
+            "checkpoint_step": 20,
+            "seeds": [first_seed, first_seed],
+            "protocol": {"max_steps": None},
+            "fingerprint": {"machine": {"cpu": "a fast CPU"}},
+        },
+    )
+    return run
+
+
+def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
+    run = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "training.steps=20")
+    made_by = TOOL["ship"](run, tmp_path / "shipped")
+    files = {str(path.relative_to(tmp_path / "shipped")) for path in (tmp_path / "shipped").rglob("*.*")}
+    assert {path for path in files if "." in Path(path).name} == {
+        "config.yaml",
+        "status.json",
+        "metrics.jsonl",
+        "made_by.json",
+        "checkpoints/step-20/policy.safetensors",
+        "checkpoints/step-20/policy.json",
+        "rollouts/reported/episodes.jsonl",
+        "rollouts/reported/summary.json",
+    }
+    assert (tmp_path / "shipped" / "metrics.jsonl").read_text().count("\n") == 3
+    assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
+    assert (made_by["code"], made_by["seed"]) == ("abc", 3)
+    assert made_by["results"]["nfe 1"]["success_episodes"] == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"state": RUNNING}, "not a finished run"),
+        ({"first_seed": 10_000}, "no evaluation of the reporting band"),
+        ({"size": 8_000_001}, "wanted at most 8000000"),
+    ],
+)
+def test_what_may_not_be_shipped_is_refused_and_nothing_is_written(tmp_path, changes, reason):
+    run = make_run(tmp_path / "run", **changes)
+    with pytest.raises(UserError, match=reason):
+        TOOL["ship"](run, tmp_path / "shipped")
+    assert not (tmp_path / "shipped").exists()
+
+
+def test_a_shipped_policy_is_not_overwritten(tmp_path):
+    (tmp_path / "shipped").mkdir()
+    with pytest.raises(UserError, match="is there already"):
+        TOOL["ship"](make_run(tmp_path / "run"), tmp_path / "shipped")
