@@ -10,10 +10,11 @@ import torch
 from hydra.utils import instantiate
 from torch import Tensor, nn
 
+from imfvla.chunks import ChunkFrame
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
-from imfvla.nn.normaliser import Normaliser
+from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
 
@@ -21,7 +22,14 @@ class Policy(nn.Module):
     """What the training loop and the evaluator know of any method: a loss and a prediction, in physical units."""
 
     def __init__(
-        self, *, horizon: Horizon, action_dim: int, encoder: nn.Module, core: nn.Module, generator: Generator
+        self,
+        *,
+        horizon: Horizon,
+        action_dim: int,
+        chunks: ChunkFrame,
+        encoder: nn.Module,
+        core: nn.Module,
+        generator: Generator,
     ) -> None:
         super().__init__()
         self.horizon = horizon
@@ -29,7 +37,7 @@ class Policy(nn.Module):
         self.encoder = encoder
         self.core = core
         self.generator = generator
-        self.action_normaliser = Normaliser(action_dim)
+        self.chunks = chunks
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -38,7 +46,7 @@ class Policy(nn.Module):
 
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
-        actions = self.action_normaliser.normalise(batch.actions)
+        actions = self.chunks.normalise(batch.actions, batch.obs.state[:, -1])
         actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
         context = self.core.condition(self.encoder(batch.obs))
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
@@ -49,19 +57,22 @@ class Policy(nn.Module):
         if nfe < 1:
             raise UserError(f"nfe, the number of flow evaluations, must be at least 1, found {nfe}.")
         context = self.core.condition(self.encoder(obs))
-        return self.action_normaliser.denormalise(self.generator.sample(self.core, context, noise, nfe))
+        chunk = self.generator.sample(self.core, context, noise, nfe)
+        return self.chunks.denormalise(chunk, obs.state[:, -1])
 
 
-def build_policy(config: Mapping[str, Any], statistics: Any | None = None) -> Policy:
+def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
     """The policy that a composed configuration describes, with the normalisers fitted where `statistics` are given.
 
     Without statistics the normalisers are not-a-number until a checkpoint fills them. Raises UserError where the
     parts do not fit together.
     """
     try:
+        horizon = Horizon(**config["horizon"])
         policy = Policy(
-            horizon=Horizon(**config["horizon"]),
+            horizon=horizon,
             action_dim=config["action_dim"],
+            chunks=ChunkFrame(config["action_frame"], horizon.pred, config["action_dim"]),
             encoder=instantiate(config["encoder"], _convert_="all"),
             core=instantiate(config["core"], _convert_="all"),
             generator=instantiate(config["generator"], _convert_="all"),
@@ -78,10 +89,6 @@ def build_policy(config: Mapping[str, Any], statistics: Any | None = None) -> Po
             raise reason from None
         raise UserError(f"the configured policy cannot be built: {reason}") from error
     if statistics is not None:
-        policy.encoder.state_normaliser.fit(
-            torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max)
-        )
-        policy.action_normaliser.fit(
-            torch.as_tensor(statistics.action_min), torch.as_tensor(statistics.action_max)
-        )
+        policy.encoder.fit(torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max))
+        policy.chunks.fit(statistics)
     return policy

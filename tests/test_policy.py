@@ -12,8 +12,10 @@ from imfvla.types import Batch, Observation
 STATISTICS = SimpleNamespace(
     state_min=np.full(16, -2.0, np.float32),
     state_max=np.full(16, 2.0, np.float32),
-    action_min=np.full(16, -3.0, np.float32),
-    action_max=np.full(16, 1.0, np.float32),
+    action_mean=np.full(16, -1.0, np.float32),
+    action_std=np.full(16, 2.0, np.float32),
+    displacement_mean=np.full((8, 16), 0.5, np.float32),
+    displacement_std=np.full((8, 16), 0.1, np.float32),
 )
 
 
@@ -21,6 +23,7 @@ def config(**changes):
     return {
         "horizon": {"obs": 1, "pred": 8, "exec": 4},
         "action_dim": 16,
+        "action_frame": "absolute",
         "encoder": {
             "_target_": "imfvla.encoders.observation.ObservationEncoder",
             "vision": {

@@ -84,11 +84,12 @@ MAY_IMPORT = {
     "nn": {"torch"},
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn"},
-    "policy": {"torch", "generators", "horizon", "nn", "types"},
+    "chunks": {"torch", "episode", "nn", "statistics"},
+    "policy": {"torch", "chunks", "generators", "horizon", "nn", "statistics", "types"},
     "tasks": {"mujoco", "dm_control", "episode", "gl"},
     "recording": {"episode"},
     "reporting": {"episode", "files", "run_directory"},
-    "data": {"torch", "horizon", "instruction", "recording", "types"},
+    "data": {"torch", "horizon", "instruction", "recording", "statistics", "types"},
 }
 
 

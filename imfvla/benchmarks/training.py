@@ -95,7 +95,7 @@ def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -
         with _timed(spent, "encoder"):
             context = policy.core.condition(policy.encoder(batch.obs))
         with _timed(spent, "core"), _timed_derivative(policy.generator, spent):
-            actions = policy.action_normaliser.normalise(batch.actions)
+            actions = policy.chunks.normalise(batch.actions, batch.obs.state[:, -1])
             actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
             loss, _ = policy.generator.loss(
                 policy.core, context, actions, batch.valid, torch.Generator().manual_seed(trainer.step)

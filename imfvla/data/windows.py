@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from imfvla.data.frame_store import FrameStore
-from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
+from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
 
@@ -58,8 +58,10 @@ class Windows:
         return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
 
     def statistics(self) -> Statistics:
-        """Over all control steps of the store, with frames or without."""
-        return Statistics.of(self.store.state, self.store.action)
+        """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
+        store = self.store
+        displacement = store.action[self._followed] - store.state[self._observed[:, -1:]]
+        return Statistics.of(store.state, store.action, displacement, self._valid)
 
     def _index_windows(self) -> None:
         episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []

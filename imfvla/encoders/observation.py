@@ -11,6 +11,8 @@ from imfvla.instruction import NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.types import Observation
 
+MIN_STATE_SCALE = 5e-3  # rad, or share of a gripper's opening
+
 
 class ObservationEncoder(nn.Module):
     """Context tokens (B, L, width), L = To * (V * tokens_per_view + 1) + 1: views and state of each step, one sentence.
@@ -44,6 +46,10 @@ class ObservationEncoder(nn.Module):
         self.state = nn.Sequential(nn.Linear(state_dim, width), nn.SiLU(), nn.Linear(width, width))
         self.words = nn.EmbeddingBag(NUM_WORD_IDS, width, mode="mean", padding_idx=0)
         self.step_identity = nn.Parameter(0.02 * torch.randn(observed_steps, 1, width))
+
+    def fit(self, low: Tensor, high: Tensor) -> None:
+        """Takes the range of the states (S,), which is stretched to [-1, 1]."""
+        self.state_normaliser.fit((low + high) / 2, (high - low) / 2, MIN_STATE_SCALE)
 
     def forward(self, obs: Observation) -> Tensor:
         batch, steps, views = obs.images.shape[:3]

@@ -23,7 +23,7 @@ class ViewTokens(nn.Module):
         if maps % tokens:
             raise ValueError(f"{maps} attention maps cannot be shared evenly by {tokens} tokens per view")
         self.tokens = tokens
-        self.maps = nn.Parameter(torch.randn(views, maps, channels) / math.sqrt(channels))
+        self.maps = nn.Parameter(2 * torch.randn(views, maps, channels) / math.sqrt(channels))
         self.features = nn.Parameter(torch.randn(views, features, channels) / math.sqrt(channels))
         inputs = (maps // tokens) * (features + 2)
         self.output = nn.Parameter(torch.randn(views, tokens, inputs, width) / math.sqrt(inputs))

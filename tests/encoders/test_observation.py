@@ -22,7 +22,7 @@ def encoder(trunk="compact", steps=1):
         maps_per_view=4,
         features_per_map=3,
     )
-    made.state_normaliser.fit(-torch.ones(16), torch.ones(16))
+    made.fit(-torch.ones(16), torch.ones(16))
     return made
 
 
