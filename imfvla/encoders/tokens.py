@@ -7,6 +7,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 
 class ViewTokens(nn.Module):
@@ -14,6 +15,10 @@ class ViewTokens(nn.Module):
 
     A generalised spatial softmax (arXiv 1504.00702): positions make the tokens precise to a fraction of a feature,
     features tell what lies there. Every view has weights of its own. (B, V, C, h, w) -> (B, V * tokens, width).
+
+    Features and scores are normalised over the positions of a picture: what stands out is attended to from the
+    start. Without it the average of the background outweighs a small thing on a table a thousand to one, and a policy
+    learns to ignore its cameras.
     """
 
     def __init__(
@@ -23,7 +28,8 @@ class ViewTokens(nn.Module):
         if maps % tokens:
             raise ValueError(f"{maps} attention maps cannot be shared evenly by {tokens} tokens per view")
         self.tokens = tokens
-        self.maps = nn.Parameter(2 * torch.randn(views, maps, channels) / math.sqrt(channels))
+        self.maps = nn.Parameter(torch.randn(views, maps, channels) / math.sqrt(channels))
+        self.sharpness = nn.Parameter(torch.ones(views, maps, 1))
         self.features = nn.Parameter(torch.randn(views, features, channels) / math.sqrt(channels))
         inputs = (maps // tokens) * (features + 2)
         self.output = nn.Parameter(torch.randn(views, tokens, inputs, width) / math.sqrt(inputs))
@@ -31,14 +37,19 @@ class ViewTokens(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         height, width = x.shape[-2:]
-        x = x.flatten(3)
-        attention = (self.maps @ x).softmax(-1)  # (B, V, M, P)
+        x = across_positions(x.flatten(3))
+        attention = (self.sharpness * across_positions(self.maps @ x)).softmax(-1)  # (B, V, M, P)
         grid = positions(height, width, x)
         seen = torch.cat(((self.features @ x), grid.expand(*x.shape[:2], 2, -1)), dim=2)  # (B, V, F + 2, P)
         pooled = attention @ seen.transpose(-1, -2)  # (B, V, M, F + 2)
         pooled = pooled.unflatten(2, (self.tokens, -1)).flatten(3)
         tokens = torch.einsum("bvki,vkid->bvkd", pooled, self.output) + self.identity
         return tokens.flatten(1, 2)
+
+
+def across_positions(x: Tensor) -> Tensor:
+    """Zero mean and unit variance over the last axis."""
+    return F.layer_norm(x, x.shape[-1:])
 
 
 def positions(height: int, width: int, like: Tensor) -> Tensor:

@@ -77,12 +77,25 @@ def test_a_bright_spot_is_located_where_it_is():
     """With one map that follows the brightness, the pooled position is the spot's."""
     tokens = ViewTokens(views=1, channels=1, tokens=1, maps=1, features=1, width=3)
     with torch.no_grad():
-        tokens.maps.fill_(100.0)
+        tokens.maps.fill_(1.0)
+        tokens.sharpness.fill_(100.0)
         tokens.output.copy_(torch.eye(3))
         tokens.identity.zero_()
     x = torch.zeros(1, 1, 1, 5, 5)
     x[..., 3, 0] = 1.0
     torch.testing.assert_close(tokens(x)[0, 0, 1:], torch.tensor([0.5, -1.0]))
+
+
+def test_a_small_thing_on_a_plain_table_stands_out_before_any_training():
+    """Moving it changes the tokens about as much as they measure, whatever the background's brightness."""
+    torch.manual_seed(0)
+    made = encoder()
+    pictures = torch.full((2, 1, 2, 3, 64, 64), 190, dtype=torch.uint8)
+    for row, (top, left) in enumerate(((8, 8), (40, 48))):
+        pictures[row, ..., top : top + 6, left : left + 10] = torch.tensor([250, 120, 20])[:, None, None]
+    same = torch.zeros(2, 1, 16), torch.zeros(2, 16, dtype=torch.int64)
+    tokens = made(Observation(pictures, *same))[:, :4]
+    assert (tokens[0] - tokens[1]).norm() > 0.3 * tokens[0].norm()
 
 
 def test_maps_must_be_shared_evenly_by_tokens():
