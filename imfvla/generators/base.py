@@ -10,6 +10,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from imfvla.errors import UserError
+
 
 class Generator(Protocol):
     """One algorithm: how to learn from chunks, how to turn noise into a chunk. Works on normalised actions."""
@@ -24,6 +26,10 @@ class Generator(Protocol):
         """A chunk (B, H, A) from noise (B, H, A) with `nfe` evaluations of the core: a pure function."""
         ...
 
+    def check_nfe(self, nfe: int) -> None:
+        """Raises UserError where `sample` cannot make do with `nfe` evaluations."""
+        ...
+
 
 TimeSampler = Callable[[int, torch.Generator], Tensor]  # how many, from which stream -> (n,) in [0, 1]
 
@@ -33,6 +39,16 @@ class UniformTimes:
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
         return torch.rand(count, generator=rng)
+
+
+class BetaTimes:
+    """t = 1 - span (1 - B), B ~ Beta(alpha, 1), drawn as U^(1/alpha) (SmolVLA, arXiv 2506.01844: 1.5 and 0.999)."""
+
+    def __init__(self, alpha: float, span: float) -> None:
+        self.alpha, self.span = alpha, span
+
+    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+        return 1 - self.span * (1 - torch.rand(count, generator=rng) ** (1 / self.alpha))
 
 
 class LogitNormalTimes:
@@ -58,7 +74,17 @@ class HighNoiseTimes:
         return 1 - self.span * torch.rand(count, generator=rng) ** self.power
 
 
+def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
+    """Mean of (B, H, A) over the valid steps and all channels: (B,)."""
+    per_step = values.mean(-1)
+    return (per_step * valid).sum(-1) / valid.sum(-1).clamp(min=1)
+
+
 def masked_error(error: Tensor, valid: Tensor) -> Tensor:
     """Mean of squared errors (B, H, A) over the valid steps and all channels: (B,)."""
-    per_step = error.square().mean(-1)
-    return (per_step * valid).sum(-1) / valid.sum(-1).clamp(min=1)
+    return masked_mean(error.square(), valid)
+
+
+def refuse_nfe(wanted: str, nfe: int) -> UserError:
+    """The error of a generator that needs `wanted` evaluations of the core and was asked for `nfe`."""
+    return UserError(f"nfe, the number of evaluations of the core, must be {wanted}, found {nfe}.")

@@ -1,0 +1,49 @@
+"""Mean Flow, the original: actions from noise in few evaluations (arXiv 2505.13447).
+
+The network gives the average velocity u(z_t, r, t) of the flow over [r, t]. It is regressed on
+sg(v_c - (t - r) du/dt), where du/dt is taken along the conditional velocity v_c = e - x of the drawn pair, not along
+the marginal one as in `imf`. Draws with r = t are flow matching and cost no derivative.
+
+Shapes: B batch, N draws per observation, H steps, A action.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from imfvla.generators.base import masked_error
+from imfvla.generators.velocity import AverageVelocity, interpolate
+
+
+class MeanFlow(AverageVelocity):
+    """Learns and samples an average velocity; `compound_draws` of `draws` have r < t, the others r = t."""
+
+    def target(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
+    ) -> tuple[Tensor, Tensor]:
+        """v - (t - r) du/dt along (v, 0, 1), which u(z, r, t) is regressed on, and (t - r) du/dt; no gradient."""
+        _, dudt = self.derivative(core, z, r, t, v, context)
+        change = (t - r)[:, None, None] * dudt
+        return v - change, change
+
+    def loss(
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of each chunk (B,), a mean over its draws."""
+        batch = len(actions)
+        context, x, noise, valid = self.repeat(context, actions, valid, rng)
+        r, t = (time.to(x) for time in self.intervals(len(x), rng))
+        z, v = interpolate(x, noise, t)
+        some = self.compound_rows(batch, x.device)
+        r = t.index_copy(0, some, r[some])
+        target, change = self.target(
+            core, z[some], r[some], t[some], v[some], context.rows(some).detach(z.dtype)
+        )
+        u = self.velocity(core, z, r, t, context)
+        error = t**self.time_power * masked_error(u - v.index_copy(0, some, target), valid)
+        loss = self.adapt(error).unflatten(0, (batch, -1)).mean(1)
+        return loss, {
+            "compound_error": error.detach()[some].mean(),
+            "change_rms": change.square().mean().sqrt(),
+        }

@@ -1,0 +1,43 @@
+"""Regression: one evaluation, no noise, the L1 error. What a generator must beat where demonstrations have modes.
+
+Shapes: B batch, H steps, A action.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from imfvla.generators.base import masked_mean, refuse_nfe
+
+
+class Regression:
+    """Learns the conditional median of the action. The core is given zeros at t = 1, r = 0.
+
+    clip: normalised actions lie within [-clip, clip]; the prediction is clamped there.
+    """
+
+    def __init__(self, *, clip: float) -> None:
+        self.clip = clip
+
+    def predict(self, core: nn.Module, context: Any, like: Tensor) -> Tensor:
+        """The core's answer, of the shape of `like` (B, H, A), which is not read."""
+        t = like.new_ones(len(like))
+        return core(torch.zeros_like(like), t, torch.zeros_like(t), context)
+
+    def loss(
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean absolute error of each chunk (B,); nothing is drawn from `rng`."""
+        error = masked_mean((self.predict(core, context, actions) - actions).abs(), valid)
+        return error, {"absolute_error": error.detach().mean()}
+
+    def check_nfe(self, nfe: int) -> None:
+        """There is one evaluation: nothing moves from noise to data in steps."""
+        if nfe != 1:
+            raise refuse_nfe("1 with generator=l1 (one-step regression)", nfe)
+
+    def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
+        """The predicted chunk (B, H, A), whatever the noise."""
+        self.check_nfe(nfe)
+        return self.predict(core, context, noise).clamp(-self.clip, self.clip)

@@ -1,0 +1,134 @@
+"""What generators on the linear path z_t = (1 - t) x + t e share: parametrisation, weighting, intervals, sampling.
+
+Shapes: B batch, N draws per observation, H steps, A action.
+"""
+
+from itertools import pairwise
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from imfvla.errors import UserError
+from imfvla.generators.base import TimeSampler, refuse_nfe
+from imfvla.nn.forward_mode import jvp
+
+MIN_TIME = 0.02  # u = (z - D) / t: in training the division stops below this time
+
+
+def interpolate(x: Tensor, noise: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """z_t and the conditional velocity e - x, both (B, H, A), of data x, noise e and times t (B,)."""
+    column = t[:, None, None]
+    return (1 - column) * x + column * noise, noise - x
+
+
+class LinearPath:
+    """A velocity of the flow from noise to data, given by the core in one of two parametrisations.
+
+    parametrisation: what the network outputs: the "velocity" u itself, or the clean action D = z - t u ("data").
+    time_power: errors of velocities are weighted by t ** time_power; 2 makes them errors of the clean action.
+    adaptive_power, adaptive_offset: see `adapt`.
+    draws: noise draws per observation; the observation is encoded once for all of them.
+    clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
+    """
+
+    def __init__(
+        self,
+        *,
+        parametrisation: Literal["data", "velocity"],
+        times: TimeSampler,
+        time_power: float,
+        adaptive_power: float,
+        adaptive_offset: float,
+        draws: int,
+        clip: float,
+    ) -> None:
+        if parametrisation not in ("data", "velocity"):
+            raise UserError(f"generator.parametrisation must be data or velocity, found {parametrisation!r}.")
+        if draws < 1:
+            raise UserError(f"generator.draws must be at least 1, found {draws}.")
+        self.parametrisation = parametrisation
+        self.times = times
+        self.time_power = time_power
+        self.adaptive_power, self.adaptive_offset = adaptive_power, adaptive_offset
+        self.draws = draws
+        self.clip = clip
+
+    def velocity(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, min_time: float = MIN_TIME
+    ) -> Tensor:
+        """u(z, r, t): z (B, H, A), r and t (B,) -> (B, H, A). `min_time` bounds what the data form divides by."""
+        output = core(z, t, r, context)
+        if self.parametrisation == "velocity":
+            return output
+        return (z - output) / t.clamp(min=min_time)[:, None, None]
+
+    def repeat(
+        self, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+    ) -> tuple[Any, Tensor, Tensor, Tensor]:
+        """Context, actions, their noise and validity for all draws, those of an observation together: (B * N, ...)."""
+        x = actions.repeat_interleave(self.draws, dim=0)
+        noise = torch.randn(x.shape, generator=rng).to(x)
+        return context.repeat(self.draws), x, noise, valid.repeat_interleave(self.draws, dim=0)
+
+    def adapt(self, error: Tensor) -> Tensor:
+        """error / sg(error + offset) ** power: large errors count for less (arXiv 2505.13447)."""
+        if self.adaptive_power == 0:
+            return error
+        return error / (error.detach() + self.adaptive_offset) ** self.adaptive_power
+
+    def check_nfe(self, nfe: int) -> None:
+        """Any number of steps is possible but none."""
+        if nfe < 1:
+            raise refuse_nfe("at least 1", nfe)
+
+    def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
+        """z_r = z_t - (t - r) u(z_t, r, t) over `nfe` equal intervals from t = 1 to 0."""
+        self.check_nfe(nfe)
+        times = torch.linspace(1, 0, nfe + 1).to(noise)
+        z = noise
+        for t, r in pairwise(times):
+            ts, rs = t.expand(len(z)), r.expand(len(z))
+            z = z - (t - r) * self.velocity(core, z, rs, ts, context, min_time=0.0)
+        return z.clamp(-self.clip, self.clip)
+
+
+class AverageVelocity(LinearPath):
+    """An average velocity u(z_t, r, t) of the flow over [r, t], learned through its derivative along the flow.
+
+    times: t of every draw; r = t U with U uniform, save a share `boundary_share` of draws with (r, t) = (0, 1), the
+      interval of a single evaluation.
+    compound_draws: how many draws of an observation are intervals; the others are the share of draws with r = t.
+    The rest as in `LinearPath`.
+    """
+
+    def __init__(self, *, boundary_share: float, draws: int, compound_draws: int, **options: Any) -> None:
+        super().__init__(draws=draws, **options)
+        if not 1 <= compound_draws <= draws:
+            raise UserError(
+                f"generator.compound_draws must lie between 1 and generator.draws={draws}, found {compound_draws}."
+            )
+        self.boundary_share = boundary_share
+        self.compound_draws = compound_draws
+
+    def derivative(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
+    ) -> tuple[Tensor, Tensor]:
+        """u and du/dt along (v, 0, 1) in (z, r, t) (paper eq. 6), without gradient."""
+        return jvp(
+            lambda z, r, t: self.velocity(core, z, r, t, context),
+            (z, r, t),
+            (v, torch.zeros_like(r), torch.ones_like(t)),
+        )
+
+    def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Times r <= t (count,) of the compound loss."""
+        t = self.times(count, rng)
+        r = t * torch.rand(count, generator=rng)
+        boundary = torch.rand(count, generator=rng) < self.boundary_share
+        return r.masked_fill(boundary, 0.0), t.masked_fill(boundary, 1.0)
+
+    def compound_rows(self, batch: int, device: torch.device) -> Tensor:
+        """Which rows of (B * N, ...) are the first `compound_draws` draws of their observation."""
+        rows = torch.arange(batch * self.draws, device=device).unflatten(0, (batch, self.draws))
+        return rows[:, : self.compound_draws].flatten()
