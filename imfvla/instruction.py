@@ -6,7 +6,7 @@ import zlib
 import numpy as np
 
 MAX_WORDS = 16
-NUM_WORD_IDS = 1024  # id 0 is padding; 1 ... NUM_WORD_IDS - 1 are words
+NUM_WORD_IDS = 512  # id 0 is padding; 1 ... NUM_WORD_IDS - 1 are words
 
 
 def tokenize(text: str) -> np.ndarray:

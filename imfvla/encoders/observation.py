@@ -3,10 +3,12 @@
 Shapes: B batch, To observed steps, V views, S state, D width, L tokens.
 """
 
+import math
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
-from imfvla.encoders.tokens import ViewTokens
 from imfvla.instruction import NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.types import Observation
@@ -15,9 +17,11 @@ MIN_STATE_SCALE = 5e-3  # rad, or share of a gripper's opening
 
 
 class ObservationEncoder(nn.Module):
-    """Context tokens (B, L, width), L = To * (V * tokens_per_view + 1) + 1: views and state of each step, one sentence.
+    """Context tokens (B, L, width): views and state of each step, one for the sentence, one that summarises them all.
 
-    All views of all steps run through the trunk as one batch.
+    L = To * (V * tokens + 1) + 2, with `tokens` of each view. All views of all steps run through the trunk `vision` as
+    one batch; `view_tokens` builds what turns its maps into tokens from (views, channels, grid, width). The summary
+    comes last: the core hands it to every action token, before any attention is learnt.
     """
 
     def __init__(
@@ -28,23 +32,18 @@ class ObservationEncoder(nn.Module):
         observed_steps: int,
         state_dim: int,
         width: int,
-        tokens_per_view: int,
-        maps_per_view: int,
-        features_per_map: int,
+        image_size: tuple[int, int],
+        view_tokens: Callable[..., nn.Module],
     ) -> None:
         super().__init__()
         self.vision = vision.to(memory_format=torch.channels_last)
-        self.view_tokens = ViewTokens(
-            views=views,
-            channels=vision.channels,
-            tokens=tokens_per_view,
-            maps=maps_per_view,
-            features=features_per_map,
-            width=width,
-        )
+        grid = tuple(math.ceil(pixels / vision.stride) for pixels in image_size)
+        self.view_tokens = view_tokens(views=views, channels=vision.channels, grid=grid, width=width)
         self.state_normaliser = Normaliser(state_dim)
         self.state = nn.Sequential(nn.Linear(state_dim, width), nn.SiLU(), nn.Linear(width, width))
         self.words = nn.EmbeddingBag(NUM_WORD_IDS, width, mode="mean", padding_idx=0)
+        num_tokens = observed_steps * (views * self.view_tokens.tokens + 1) + 1
+        self.summary = nn.Linear(num_tokens * width, width)
         self.step_identity = nn.Parameter(0.02 * torch.randn(observed_steps, 1, width))
 
     def fit(self, low: Tensor, high: Tensor) -> None:
@@ -59,4 +58,5 @@ class ObservationEncoder(nn.Module):
         state = self.state(self.state_normaliser.normalise(obs.state)).flatten(0, 1).unsqueeze(1)
         tokens = torch.cat((seen, state), dim=1).unflatten(0, (batch, steps)) + self.step_identity
         sentence = self.words(obs.instruction).unsqueeze(1)
-        return torch.cat((tokens.flatten(1, 2), sentence), dim=1)
+        tokens = torch.cat((tokens.flatten(1, 2), sentence), dim=1)
+        return torch.cat((tokens, self.summary(tokens.flatten(1)).unsqueeze(1)), dim=1)

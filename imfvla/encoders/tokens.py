@@ -1,4 +1,4 @@
-"""From feature maps to a few tokens per view: learned spatial attention that says what is seen and where.
+"""From feature maps to a few tokens per view: the whole map through a matrix, or learned spatial attention.
 
 Shapes: B batch, V views, C channels, h w feature map, P = h w positions, M attention maps, K tokens per view, D width.
 """
@@ -10,7 +10,26 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
-class ViewTokens(nn.Module):
+class GridTokens(nn.Module):
+    """Every feature of a view's map has its weight in every token: (B, V, C, h, w) -> (B, V * tokens, width).
+
+    The place of a feature is its index, so that where something lies is linear in what is seen and quick to learn.
+    The number of weights grows with the map: for small ones.
+    """
+
+    def __init__(self, *, views: int, channels: int, grid: tuple[int, int], width: int, tokens: int) -> None:
+        super().__init__()
+        inputs = channels * grid[0] * grid[1]
+        self.tokens = tokens
+        self.output = nn.Parameter(torch.randn(views, inputs, tokens * width) / math.sqrt(inputs))
+        self.identity = nn.Parameter(0.02 * torch.randn(views, tokens, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        tokens = torch.einsum("bvi,vid->bvd", over_last_axis(x.flatten(3)).flatten(2), self.output)
+        return (tokens.unflatten(2, (self.tokens, -1)) + self.identity).flatten(1, 2)
+
+
+class AttendedTokens(nn.Module):
     """Each of `maps` attention maps of a view yields its mean position and the mean of a few features under it.
 
     A generalised spatial softmax (arXiv 1504.00702): positions make the tokens precise to a fraction of a feature,
@@ -22,7 +41,15 @@ class ViewTokens(nn.Module):
     """
 
     def __init__(
-        self, *, views: int, channels: int, tokens: int, maps: int, features: int, width: int
+        self,
+        *,
+        views: int,
+        channels: int,
+        grid: tuple[int, int],
+        width: int,
+        tokens: int,
+        maps: int,
+        features: int,
     ) -> None:
         super().__init__()
         if maps % tokens:
@@ -37,8 +64,8 @@ class ViewTokens(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         height, width = x.shape[-2:]
-        x = across_positions(x.flatten(3))
-        attention = (self.sharpness * across_positions(self.maps @ x)).softmax(-1)  # (B, V, M, P)
+        x = over_last_axis(x.flatten(3))
+        attention = (self.sharpness * over_last_axis(self.maps @ x)).softmax(-1)  # (B, V, M, P)
         grid = positions(height, width, x)
         seen = torch.cat(((self.features @ x), grid.expand(*x.shape[:2], 2, -1)), dim=2)  # (B, V, F + 2, P)
         pooled = attention @ seen.transpose(-1, -2)  # (B, V, M, F + 2)
@@ -47,8 +74,8 @@ class ViewTokens(nn.Module):
         return tokens.flatten(1, 2)
 
 
-def across_positions(x: Tensor) -> Tensor:
-    """Zero mean and unit variance over the last axis."""
+def over_last_axis(x: Tensor) -> Tensor:
+    """Shifted and scaled to zero mean and unit variance over the last axis."""
     return F.layer_norm(x, x.shape[-1:])
 
 

@@ -35,26 +35,26 @@ class ResidualBlock(nn.Module):
 
 
 class CompactCNN(nn.Sequential):
-    """A small trunk for CPUs, 8 pixels a feature: (N, 3, H, W) -> (N, channels, H / 8, W / 8).
+    """Three strided convolutions for CPUs, 16 pixels a feature: (N, 3, H, W) -> (N, channels, H / 16, W / 16)."""
 
-    Most of its work is done where convolutions are cheap: the stem strides over 4 pixels at once.
-    """
+    stride = 16
 
-    def __init__(self, stem_channels: int, channels: int, num_blocks: int) -> None:
+    def __init__(self, hidden: tuple[int, int], channels: int) -> None:
         super().__init__(
-            nn.Conv2d(3, stem_channels, 7, 4, 3, bias=False),
-            norm(stem_channels),
+            nn.Conv2d(3, hidden[0], 5, 4, 2),
             nn.SiLU(),
-            nn.Conv2d(stem_channels, channels, 3, 2, 1, bias=False),
-            norm(channels),
+            nn.Conv2d(hidden[0], hidden[1], 3, 2, 1),
             nn.SiLU(),
-            *(ResidualBlock(channels, channels) for _ in range(num_blocks)),
+            nn.Conv2d(hidden[1], channels, 3, 2, 1),
+            nn.SiLU(),
         )
         self.channels = channels
 
 
 class ResNet18(nn.Sequential):
     """ResNet18 with group norm for batch norm, 32 pixels a feature: (N, 3, H, W) -> (N, 512, H / 32, W / 32)."""
+
+    stride = 32
 
     def __init__(self) -> None:
         super().__init__(

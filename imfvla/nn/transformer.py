@@ -2,7 +2,7 @@
 
 - Context, time and action tokens run through the same weights. Context tokens do not see action tokens, so that
   their keys and values are computed once per observation and serve every flow evaluation, every noise draw and the
-  Jacobian-vector product.
+  Jacobian-vector product. The last context token, a summary, is also added to every action token.
 - Sublayers (attention, SwiGLU) read what the residual hands them, through a pre-norm whose gain is the next layer's.
 - Several consecutive steps of the sequence share one token ("patch").
 - The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
@@ -25,9 +25,10 @@ from imfvla.nn.linear import Linear
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """The context of a batch as every block's keys and values; made by `TransformerCore.condition`."""
+    """The context of a batch as `TransformerCore.condition` prepares it."""
 
-    blocks: tuple[KeyValue, ...]
+    blocks: tuple[KeyValue, ...]  # of every block
+    summary: Tensor  # (B, D), added to every action token
 
     def repeat(self, times: int) -> "Conditioning":
         """Each row `times` times in succession: (B, ...) -> (B * times, ...)."""
@@ -43,7 +44,8 @@ class Conditioning:
         return self.map(lambda x: x[index])
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Conditioning":
-        return Conditioning(tuple((function(keys), function(values)) for keys, values in self.blocks))
+        blocks = tuple((function(keys), function(values)) for keys, values in self.blocks)
+        return Conditioning(blocks, function(self.summary))
 
 
 class SwiGLU(nn.Module):
@@ -95,6 +97,7 @@ class TransformerCore(nn.Module):
             raise ValueError(f"core.patch must divide the {steps} steps of horizon.pred, found {patch}")
         self.steps, self.channels, self.width, self.patch = steps, channels, width, patch
         self.input = Linear(patch * channels, width)
+        self.summary = Linear(width, width)
         self.position = nn.Parameter(0.02 * torch.randn(steps // patch, width))
         self.time = TimeEmbedding(width, max_rad)
         self.interval = TimeEmbedding(width, max_rad)
@@ -106,7 +109,7 @@ class TransformerCore(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def condition(self, context: Tensor) -> Conditioning:
-        """Runs the context tokens (B, L, D) through the stack once and keeps every block's keys and values."""
+        """Runs the context tokens (B, L, D), of which the last one is a summary, through the stack once."""
         history = self.residual.begin(context)
         cached = []
         for block in self.blocks:
@@ -116,12 +119,12 @@ class TransformerCore(nn.Module):
                 break  # nothing reads the context tokens after the last keys and values
             history.add(block.attention.attend(queries, own))
             history.add(block.mlp(block.mlp_norm(history.read())))
-        return Conditioning(tuple(cached))
+        return Conditioning(tuple(cached), self.summary(context[:, -1]))
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
         tokens = self.input(x.unflatten(1, (-1, self.patch)).flatten(2))
-        tokens = affine(tokens, None, self.position)
+        tokens = affine(tokens, None, self.position + context.summary.unsqueeze(1))
         times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
         history = self.residual.begin(torch.cat((times, tokens), dim=1))
         for block, prefix in zip(self.blocks, context.blocks, strict=True):

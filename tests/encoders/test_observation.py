@@ -1,26 +1,31 @@
+from functools import partial
+
 import pytest
 import torch
 
 from imfvla.encoders.observation import ObservationEncoder
-from imfvla.encoders.tokens import ViewTokens
+from imfvla.encoders.tokens import AttendedTokens, GridTokens
 from imfvla.encoders.vision import CompactCNN, ResNet18
 from imfvla.instruction import tokenize
 from imfvla.types import Observation
 
-TRUNKS = {"compact": (lambda: CompactCNN(16, 32, 1), 8), "resnet18": (ResNet18, 32)}
+TRUNKS = {"compact": lambda: CompactCNN((16, 16), 8), "resnet18": ResNet18}
+TOKENS = {
+    "grid": partial(GridTokens, tokens=2),
+    "attended": partial(AttendedTokens, tokens=2, maps=4, features=3),
+}
 
 
-def encoder(trunk="compact", steps=1):
+def encoder(trunk="compact", steps=1, tokens="grid"):
     torch.manual_seed(0)
     made = ObservationEncoder(
-        vision=TRUNKS[trunk][0](),
+        vision=TRUNKS[trunk](),
         views=2,
         observed_steps=steps,
         state_dim=16,
         width=24,
-        tokens_per_view=2,
-        maps_per_view=4,
-        features_per_map=3,
+        image_size=(64, 64),
+        view_tokens=TOKENS[tokens],
     )
     made.fit(-torch.ones(16), torch.ones(16))
     return made
@@ -39,15 +44,15 @@ def observation(batch=3, steps=1, size=64):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_tokens_count_views_states_and_one_sentence(trunk, steps):
     tokens = encoder(trunk, steps)(observation(steps=steps))
-    assert tokens.shape == (3, steps * (2 * 2 + 1) + 1, 24)
+    assert tokens.shape == (3, steps * (2 * 2 + 1) + 2, 24)
     assert tokens.isfinite().all()
 
 
 @pytest.mark.parametrize("trunk", TRUNKS)
 def test_trunks_shrink_pictures_by_their_stride(trunk):
-    make, stride = TRUNKS[trunk]
-    vision = make()
-    assert vision(torch.rand(2, 3, 64, 64)).shape == (2, vision.channels, 64 // stride, 64 // stride)
+    vision = TRUNKS[trunk]()
+    side = 64 // vision.stride
+    assert vision(torch.rand(2, 3, 64, 64)).shape == (2, vision.channels, side, side)
 
 
 def test_rows_do_not_see_each_other():
@@ -67,15 +72,16 @@ def test_every_part_of_an_observation_matters():
         assert not torch.allclose(made(changed), base)
 
 
-def test_every_parameter_learns():
-    made = encoder()
+@pytest.mark.parametrize("tokens", TOKENS)
+def test_every_parameter_learns(tokens):
+    made = encoder(tokens=tokens)
     made(observation()).square().sum().backward()
     assert [name for name, p in made.named_parameters() if p.grad is None or not p.grad.any()] == []
 
 
 def test_a_bright_spot_is_located_where_it_is():
     """With one map that follows the brightness, the pooled position is the spot's."""
-    tokens = ViewTokens(views=1, channels=1, tokens=1, maps=1, features=1, width=3)
+    tokens = AttendedTokens(views=1, channels=1, grid=(5, 5), tokens=1, maps=1, features=1, width=3)
     with torch.no_grad():
         tokens.maps.fill_(1.0)
         tokens.sharpness.fill_(100.0)
@@ -86,10 +92,11 @@ def test_a_bright_spot_is_located_where_it_is():
     torch.testing.assert_close(tokens(x)[0, 0, 1:], torch.tensor([0.5, -1.0]))
 
 
-def test_a_small_thing_on_a_plain_table_stands_out_before_any_training():
+@pytest.mark.parametrize("tokens", TOKENS)
+def test_a_small_thing_on_a_plain_table_stands_out_before_any_training(tokens):
     """Moving it changes the tokens about as much as they measure, whatever the background's brightness."""
     torch.manual_seed(0)
-    made = encoder()
+    made = encoder(tokens=tokens)
     pictures = torch.full((2, 1, 2, 3, 64, 64), 190, dtype=torch.uint8)
     for row, (top, left) in enumerate(((8, 8), (40, 48))):
         pictures[row, ..., top : top + 6, left : left + 10] = torch.tensor([250, 120, 20])[:, None, None]
@@ -100,4 +107,4 @@ def test_a_small_thing_on_a_plain_table_stands_out_before_any_training():
 
 def test_maps_must_be_shared_evenly_by_tokens():
     with pytest.raises(ValueError, match="5 attention maps cannot be shared evenly by 2 tokens"):
-        ViewTokens(views=1, channels=1, tokens=2, maps=5, features=1, width=3)
+        AttendedTokens(views=1, channels=1, grid=(5, 5), tokens=2, maps=5, features=1, width=3)
