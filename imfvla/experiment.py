@@ -48,7 +48,9 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     optim = build(OptimOptions, config["optim"], "optim")
     evaluation = build(EvaluationOptions, config["evaluation"], "evaluation")
     build(Horizon, config["horizon"], "horizon")
-    build_policy(config)  # what does not fit together is told before demonstrations are collected
+    policy = build_policy(config)  # what does not fit together is told before demonstrations are collected
+    for nfe in evaluation.nfe:
+        policy.generator.check_nfe(nfe)
     seed = config["seed"]
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
     with run.lock():

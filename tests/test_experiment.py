@@ -138,3 +138,11 @@ def test_weights_of_another_method_are_refused(calls, tmp_path):
         UserError, match=r"policy\.safetensors does not fit the configured policy: missing core"
     ):
         load_policy(run)
+
+
+def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anything_is_done(calls, tmp_path):
+    run = RunDirectory(tmp_path / "run")
+    with pytest.raises(UserError, match="nfe"):
+        run_experiment(compose("train", [*TINY, "generator=l1"]), run)
+    assert calls == []
+    assert not run.status()
