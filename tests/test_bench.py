@@ -11,7 +11,7 @@ from imfvla.benchmarks.training import PARTS
 
 TOY = (
     "observation.image_size=[32,32]", "core.width=16", "core.depth=1", "core.heads=2", "training.batch_size=2",
-    "training.threads=1", "encoder.vision.channels=16", "encoder.vision.stem_channels=16",
+    "training.threads=1", "encoder.vision.channels=4", "encoder.vision.hidden=[8,8]",
 )  # fmt: skip
 
 

@@ -29,7 +29,10 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
     (run.path / "config.yaml").write_text(yaml.safe_dump({"name": "socket_ph32_exec16", "seed": 3}))
     for step in (10, 20):
         weights = run.weights_directory(step) / "policy.safetensors"
-        write_json(weights.with_suffix(".json"), {"step": step, "train_s": 60.0, "code": "abc"})
+        write_json(
+            weights.with_suffix(".json"),
+            {"step": step, "train_s": 60.0, "fingerprint": {"code": "abc", "machine": {}}},
+        )
         weights.write_bytes(bytes(size))
     run.last_state.parent.mkdir()
     run.last_state.write_bytes(b"optimiser")

@@ -63,10 +63,10 @@ def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[
     return {
         "command": f"python -m imfvla.train +exp={config['name']}{overrides}",
         "seed": config["seed"],
-        "code": made["code"],
+        "code": made["fingerprint"]["code"],
         "steps": made["step"],
         "train_s": made["train_s"],
-        "machine": summaries[0]["fingerprint"],
+        "machine": made["fingerprint"]["machine"],
         "results": {f"nfe {s['nfe']}": {key: s[key] for key in shown} for s in summaries},
     }
 
