@@ -54,8 +54,6 @@ class Policy(nn.Module):
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         """Action chunks (B, Tp, A) in physical units from noise (B, Tp, A) and `nfe` evaluations of the core."""
-        if nfe < 1:
-            raise UserError(f"nfe, the number of flow evaluations, must be at least 1, found {nfe}.")
         context = self.core.condition(self.encoder(obs))
         chunk = self.generator.sample(self.core, context, noise, nfe)
         return self.chunks.denormalise(chunk, obs.state[:, -1])

@@ -32,5 +32,5 @@ class FlowMatching(LinearPath):
         t = self.times(len(x), rng).to(x)
         z, target = interpolate(x, noise, t)
         error = t**self.time_power * masked_error(self.velocity(core, z, t, t, context) - target, valid)
-        loss = self.adapt(error).unflatten(0, (len(actions), -1)).mean(1)
+        loss = self.per_chunk(error, len(actions))
         return loss, {"velocity_error": error.detach().mean()}

@@ -62,8 +62,8 @@ class ImprovedMeanFlow(AverageVelocity):
         compound_target = target[some] if self.compound_target == "sample" else v_fixed
         compound_error = t**self.time_power * masked_error(u + change - compound_target, valid)
 
-        loss = self.instant_weight * self.adapt(instant_error).unflatten(0, (batch, -1)).mean(1)
-        loss = loss + self.adapt(compound_error).unflatten(0, (batch, -1)).mean(1)
+        loss = self.instant_weight * self.per_chunk(instant_error, batch)
+        loss = loss + self.per_chunk(compound_error, batch)
         return loss, {
             "instant_error": instant_error.detach().mean(),
             "compound_error": compound_error.detach().mean(),

@@ -42,7 +42,7 @@ class MeanFlow(AverageVelocity):
         )
         u = self.velocity(core, z, r, t, context)
         error = t**self.time_power * masked_error(u - v.index_copy(0, some, target), valid)
-        loss = self.adapt(error).unflatten(0, (batch, -1)).mean(1)
+        loss = self.per_chunk(error, batch)
         return loss, {
             "compound_error": error.detach()[some].mean(),
             "change_rms": change.square().mean().sqrt(),

@@ -77,6 +77,10 @@ class LinearPath:
             return error
         return error / (error.detach() + self.adaptive_offset) ** self.adaptive_power
 
+    def per_chunk(self, error: Tensor, batch: int) -> Tensor:
+        """Adapted errors of all draws (B * N,) as the loss of each chunk, a mean over its draws (B,)."""
+        return self.adapt(error).unflatten(0, (batch, -1)).mean(1)
+
     def check_nfe(self, nfe: int) -> None:
         """Any number of steps is possible but none."""
         if nfe < 1:
