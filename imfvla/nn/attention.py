@@ -3,7 +3,7 @@
 PyTorch's fused attention kernels have no forward-mode derivative; the explicit form is exact and, at the short
 sequences of a policy, as quick.
 
-Shapes: B batch, L queries, P prefix tokens, D width, N heads, E = D / N.
+Shapes: B batch, L queries, P prefix or context tokens, D width, N heads, E = D / N.
 """
 
 import torch
@@ -15,17 +15,23 @@ from imfvla.nn.linear import Linear
 KeyValue = tuple[Tensor, Tensor]  # keys (B, N, E, P), transposed for the product, and values (B, N, P, E)
 
 
+def head_width(width: int, heads: int) -> int:
+    """E. Raises ValueError where `heads` does not divide `width`."""
+    if width % heads:
+        raise ValueError(f"width {width} is not divisible by {heads} heads")
+    return width // heads
+
+
 class Attention(nn.Module):
     """Self-attention whose queries also see the cached keys and values of a prefix that does not see them."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        if width % heads:
-            raise ValueError(f"width {width} is not divisible by {heads} heads")
+        scale = head_width(width, heads) ** -0.5
         self.heads = heads
         self.query_key_value = Linear(width, 3 * width, bias=False)
         with torch.no_grad():  # the usual scale of the scores, as part of the queries' weights
-            self.query_key_value.weight[:width] *= (width // heads) ** -0.5
+            self.query_key_value.weight[:width] *= scale
         self.output = Linear(width, width, bias=False)
 
     def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
@@ -48,3 +54,29 @@ class Attention(nn.Module):
     def forward(self, x: Tensor, prefix: KeyValue | None = None) -> Tensor:
         q, own = self.project(x)
         return self.attend(q, own, prefix)
+
+
+class CrossAttention(nn.Module):
+    """Attention to the cached keys and values of a context, which forward mode takes for constants."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        scale = head_width(width, heads) ** -0.5
+        self.heads = heads
+        self.query = Linear(width, width, bias=False)
+        with torch.no_grad():
+            self.query.weight *= scale
+        self.key_value = Linear(width, 2 * width, bias=False)
+        self.output = Linear(width, width, bias=False)
+
+    def project(self, context: Tensor) -> KeyValue:
+        """Keys and values of the context (B, P, D)."""
+        keys, values = self.key_value(context).unflatten(-1, (2, self.heads, -1)).unbind(-3)
+        return keys.permute(0, 2, 3, 1), values.transpose(1, 2)
+
+    def forward(self, x: Tensor, context: KeyValue) -> Tensor:
+        """Attention output (B, L, D) of x (B, L, D)."""
+        keys, values = context
+        queries = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        mixed = affine(affine(queries, keys).softmax(-1), values)
+        return self.output(mixed.transpose(1, 2).flatten(2))

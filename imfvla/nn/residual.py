@@ -11,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from imfvla.errors import UserError
 from imfvla.nn.forward_mode import affine
 
 
@@ -74,39 +75,76 @@ class AttentionResidual(nn.Module):
         self.query = nn.Parameter(torch.zeros(num_sublayers + (readout == "attn"), width))
 
     def begin(self, embedding: Tensor) -> History:
-        history = _Increments(self)
-        history.add(embedding)
-        return history
+        return _Increments(self, embedding)
 
-    def scores(self, increment: Tensor) -> Tensor:
+    def scores(self, source: Tensor) -> Tensor:
         """w_l . RMSNorm(y) for the queries of all sublayers at once: (B, T, D) -> (B, T, number of queries)."""
-        mean_square = affine(increment.square().mean(-1, keepdim=True), None, self.eps)
-        return affine(increment, self.query.T) * mean_square.rsqrt()
+        mean_square = affine(source.square().mean(-1, keepdim=True), None, self.eps)
+        return affine(source, self.query.T) * mean_square.rsqrt()
+
+
+class BlockAttentionResidual(AttentionResidual):
+    """Depth-wise attention over sums of `block_size` consecutive increments (arXiv 2603.15031).
+
+    The sources are the embedding, the sum of each finished block of sublayers and, within a block, the sum so far: a
+    deep core keeps and reads num_sublayers / block_size of them. Size 1 is `AttentionResidual`; one block for all
+    sublayers is the standard residual with the embedding apart.
+
+    Raises UserError where a block is larger than the stack.
+    """
+
+    def __init__(self, num_sublayers: int, width: int, block_size: int, readout: str = "sum") -> None:
+        if block_size not in range(1, num_sublayers + 1):
+            raise UserError(
+                f"core.residual.block_size must be a whole number from 1 to the {num_sublayers} sublayers of the "
+                f"core, found {block_size!r}: choose one of these or raise core.depth."
+            )
+        super().__init__(num_sublayers, width, readout)
+        self.block_size = block_size
+
+    def begin(self, embedding: Tensor) -> History:
+        return _BlockSums(self, embedding)
 
 
 class _Increments:
-    def __init__(self, residual: AttentionResidual) -> None:
+    """Every increment is a source of its own."""
+
+    def __init__(self, residual: AttentionResidual, embedding: Tensor) -> None:
         self.residual = residual
-        self.increments: list[Tensor] = []
-        self.scores: list[Tensor] = []
+        self.sources = [embedding]
+        self.scores = [residual.scores(embedding)]
+        self.sublayer = 0  # the next one to read
 
     def add(self, increment: Tensor) -> None:
-        self.increments.append(increment)
+        self.sources.append(increment)
         self.scores.append(self.residual.scores(increment))
+        self.sublayer += 1
 
     def weights(self, query: int) -> Tensor:
-        """a_{query, s} over the increments s so far, summing to 1: (B, T, s)."""
+        """a_{query, s} over the sources s so far, summing to 1: (B, T, s)."""
         return torch.stack(self.scores, dim=-2)[..., query].contiguous().softmax(-1)
 
     def aggregate(self, query: int) -> Tensor:
-        if len(self.increments) == 1:
-            return self.increments[0]
-        return (self.weights(query).unsqueeze(-2) @ torch.stack(self.increments, dim=-2)).squeeze(-2)
+        if len(self.sources) == 1:
+            return self.sources[0]
+        return (self.weights(query).unsqueeze(-2) @ torch.stack(self.sources, dim=-2)).squeeze(-2)
 
     def read(self) -> Tensor:
-        return self.aggregate(len(self.increments) - 1)
+        return self.aggregate(self.sublayer)
 
     def readout(self) -> Tensor:
         if self.residual.readout_kind == "attn":
             return self.aggregate(self.residual.num_sublayers)
-        return torch.stack(self.increments).sum(0)
+        return torch.stack(self.sources).sum(0)
+
+
+class _BlockSums(_Increments):
+    """The last source grows by each increment until its block is full."""
+
+    residual: BlockAttentionResidual
+
+    def add(self, increment: Tensor) -> None:
+        if self.sublayer % self.residual.block_size:
+            increment = self.sources.pop() + increment
+            self.scores.pop()
+        super().add(increment)

@@ -7,6 +7,8 @@
 - Several consecutive steps of the sequence share one token ("patch").
 - The output layer starts at zero; nothing else does but the queries of the Attention Residuals.
 
+`nn/cross.py` and `nn/adaln.py` have cores in which the context reaches the action tokens by another way.
+
 Shapes: B batch, H steps, A channels, K = H / patch tokens, L context tokens, D width.
 """
 
@@ -21,14 +23,15 @@ from imfvla.nn.attention import Attention, KeyValue
 from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
+from imfvla.nn.residual import History
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """The context of a batch as `TransformerCore.condition` prepares it."""
+    """The context of a batch as a core's `condition` prepares it."""
 
-    blocks: tuple[KeyValue, ...]  # of every block
-    summary: Tensor  # (B, D), added to every action token
+    blocks: tuple[KeyValue, ...]  # of every block that attends to the context
+    summary: Tensor  # (B, D), of the last context token
 
     def repeat(self, times: int) -> "Conditioning":
         """Each row `times` times in succession: (B, ...) -> (B * times, ...)."""
@@ -64,6 +67,8 @@ class SwiGLU(nn.Module):
 class Block(nn.Module):
     """One attention and one MLP sublayer, each with its pre-norm."""
 
+    num_sublayers = 2
+
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
         self.attention_norm = nn.LayerNorm(width, elementwise_affine=False)
@@ -71,13 +76,20 @@ class Block(nn.Module):
         self.mlp_norm = nn.LayerNorm(width, elementwise_affine=False)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
+    def forward(self, history: History, prefix: KeyValue) -> None:
+        """Adds the increments of both sublayers, whose tokens see the prefix and each other."""
+        history.add(self.attention(self.attention_norm(history.read()), prefix))
+        history.add(self.mlp(self.mlp_norm(history.read())))
+
 
 class TransformerCore(nn.Module):
     """Maps a noisy sequence, its times and a context to a sequence: (x, t, r | context) -> (B, H, A).
 
-    `residual` builds the residual from (num_sublayers, width): `AttentionResidual` or `StandardResidual`.
+    `residual` builds the residual from (num_sublayers, width), as the classes of `nn/residual.py` do.
     `max_rad` is the highest frequency of the time embeddings. Raises ValueError where `patch` does not divide `steps`.
     """
+
+    block: type[nn.Module] = Block
 
     def __init__(
         self,
@@ -101,8 +113,8 @@ class TransformerCore(nn.Module):
         self.position = nn.Parameter(0.02 * torch.randn(steps // patch, width))
         self.time = TimeEmbedding(width, max_rad)
         self.interval = TimeEmbedding(width, max_rad)
-        self.blocks = nn.ModuleList(Block(width, heads, mlp_ratio) for _ in range(depth))
-        self.residual = residual(2 * depth, width)
+        self.blocks = nn.ModuleList(self.block(width, heads, mlp_ratio) for _ in range(depth))
+        self.residual = residual(self.block.num_sublayers * depth, width)
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.output = Linear(width, patch * channels)
         nn.init.zeros_(self.output.weight)
@@ -123,12 +135,17 @@ class TransformerCore(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
-        tokens = self.input(x.unflatten(1, (-1, self.patch)).flatten(2))
-        tokens = affine(tokens, None, self.position + context.summary.unsqueeze(1))
+        tokens = affine(self.patches(x), None, self.position + context.summary.unsqueeze(1))
         times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
         history = self.residual.begin(torch.cat((times, tokens), dim=1))
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
-            history.add(block.attention(block.attention_norm(history.read()), prefix))
-            history.add(block.mlp(block.mlp_norm(history.read())))
-        out = self.output(self.norm(history.readout()[:, 2:]))
-        return out.unflatten(-1, (self.patch, self.channels)).flatten(1, 2)
+            block(history, prefix)
+        return self.sequence(self.output(self.norm(history.readout()[:, 2:])))
+
+    def patches(self, x: Tensor) -> Tensor:
+        """Tokens (B, K, D) of a sequence (B, H, A)."""
+        return self.input(x.unflatten(1, (-1, self.patch)).flatten(2))
+
+    def sequence(self, patches: Tensor) -> Tensor:
+        """The sequence (B, H, A) whose patches are (B, K, patch * A)."""
+        return patches.unflatten(-1, (self.patch, self.channels)).flatten(1, 2)

@@ -1,8 +1,11 @@
+from itertools import pairwise
+
 import pytest
 import torch
 from torch import nn
 
-from imfvla.nn.residual import AttentionResidual, StandardResidual
+from imfvla.errors import UserError
+from imfvla.nn.residual import AttentionResidual, BlockAttentionResidual, StandardResidual
 
 WIDTH = 8
 
@@ -70,3 +73,58 @@ def test_standard_residual_reads_and_returns_the_running_sum():
 def test_unknown_readout_is_refused():
     with pytest.raises(ValueError, match="'sum' or 'attn'"):
         AttentionResidual(6, WIDTH, "mean")
+
+
+def reads(residual, count=7):
+    """What each sublayer reads and what the stack returns, for increments that do not depend on it."""
+    rng = torch.Generator().manual_seed(0)
+    increments = torch.randn(count, 2, 3, WIDTH, generator=rng, dtype=torch.float64)
+    history = residual.begin(increments[0])
+    read = [history.read()]
+    for increment in increments[1:]:
+        history.add(increment)
+        if len(read) < count - 1:
+            read.append(history.read())
+    return increments, read, history
+
+
+@pytest.mark.parametrize("readout", ["sum", "attn"])
+def test_blocks_of_one_sublayer_are_full_attention_residuals(readout):
+    full = AttentionResidual(6, WIDTH, readout).double()
+    nn.init.normal_(full.query)
+    block = BlockAttentionResidual(6, WIDTH, 1, readout).double()
+    block.load_state_dict(full.state_dict())
+    (_, wanted, one), (_, found, other) = reads(full), reads(block)
+    assert all(torch.equal(a, b) for a, b in zip(wanted, found, strict=True))
+    assert torch.equal(one.readout(), other.readout())
+
+
+def test_sources_of_block_attention_are_the_embedding_whole_blocks_and_the_sum_so_far():
+    residual = BlockAttentionResidual(6, WIDTH, 4).double()
+    nn.init.normal_(residual.query)
+    increments, read, history = reads(residual)
+    bounds = ((0, 1), (0, 1, 2), (0, 1, 3), (0, 1, 4), (0, 1, 5), (0, 1, 5, 6))  # of each sublayer's sources
+    for sublayer, edges in enumerate(bounds):
+        sources = torch.stack([increments[a:b].sum(0) for a, b in pairwise(edges)])
+        keys = sources / (sources.square().mean(-1, keepdim=True) + 1e-6).sqrt()
+        weights = (keys @ residual.query[sublayer]).softmax(0)
+        torch.testing.assert_close(read[sublayer], (weights.unsqueeze(-1) * sources).sum(0))
+    torch.testing.assert_close(history.readout(), increments.sum(0))
+    torch.testing.assert_close(history.weights(5).sum(-1), torch.ones(2, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("block_size", [1, 2, 3, 6])
+def test_zero_queries_read_the_sum_of_all_increments_over_the_number_of_sources(block_size):
+    increments, read, _ = reads(BlockAttentionResidual(6, WIDTH, block_size).double())
+    for sublayer, found in enumerate(read):
+        num_sources = 1 + -(-sublayer // block_size)
+        torch.testing.assert_close(found, increments[: sublayer + 1].sum(0) / num_sources)
+
+
+@pytest.mark.parametrize("block_size", [0, 7, 2.5])
+def test_a_block_beyond_the_stack_is_refused(block_size):
+    with pytest.raises(
+        UserError,
+        match=rf"core\.residual\.block_size .* 1 to the 6 sublayers .* found {block_size}: .*core\.depth",
+    ):
+        BlockAttentionResidual(6, WIDTH, block_size)

@@ -3,21 +3,29 @@ import functools
 import pytest
 import torch
 from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
 
+from imfvla.nn.adaln import AdaptiveNormCore
+from imfvla.nn.cross import CrossAttentionCore
 from imfvla.nn.forward_mode import jvp
-from imfvla.nn.residual import AttentionResidual, StandardResidual
+from imfvla.nn.residual import AttentionResidual, BlockAttentionResidual, StandardResidual
 from imfvla.nn.transformer import TransformerCore
 
 RESIDUALS = {
     "standard": StandardResidual,
     "attnres-sum": functools.partial(AttentionResidual, readout="sum"),
     "attnres-attn": functools.partial(AttentionResidual, readout="attn"),
+    "block-sum": functools.partial(BlockAttentionResidual, block_size=4, readout="sum"),
+    "block-attn": functools.partial(BlockAttentionResidual, block_size=4, readout="attn"),
 }
+CORES = {"token": TransformerCore, "cross": CrossAttentionCore, "adaln": AdaptiveNormCore}
+each_core = pytest.mark.parametrize("conditioning", CORES)
+each_residual = pytest.mark.parametrize("residual", RESIDUALS)
 
 
-def make_core(residual, depth=3, dtype=torch.float64):
+def make_core(residual, conditioning="token", depth=3, dtype=torch.float64):
     torch.manual_seed(0)
-    core = TransformerCore(
+    core = CORES[conditioning](
         steps=8,
         channels=3,
         width=16,
@@ -41,16 +49,17 @@ def inputs(batch=2, dtype=torch.float64):
     return x, t, t / 3, context
 
 
-@pytest.mark.parametrize("residual", RESIDUALS)
-def test_jacobian_vector_product_equals_central_differences(residual):
-    core = make_core(residual)
+@each_core
+@each_residual
+def test_jacobian_vector_product_equals_central_differences(residual, conditioning):
+    core = make_core(residual, conditioning)
     x, t, r, context = inputs()
-    conditioning = core.condition(context)
+    cached = core.condition(context)
     direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(2), dtype=x.dtype)
     step = 1e-5
 
     def f(x, t):
-        return core(x, t, r, conditioning)
+        return core(x, t, r, cached)
 
     value, derivative = jvp(f, (x, t), (direction, torch.ones_like(t)))
     with torch.no_grad():
@@ -59,9 +68,25 @@ def test_jacobian_vector_product_equals_central_differences(residual):
     assert (derivative - difference).norm() / difference.norm() < 1e-6
 
 
-def test_fresh_attention_residuals_equal_the_standard_pre_norm_network():
-    standard = make_core("standard")
-    attnres = make_core("attnres-sum")
+@each_core
+@each_residual
+def test_a_derivative_costs_one_more_product_with_each_constant(residual, conditioning):
+    """Twice the products of a forward pass, and a third one where both factors depend on the input."""
+    core = make_core(residual, conditioning)
+    x, t, r, context = inputs()
+    cached = core.condition(context).detach(x.dtype)
+    with FlopCounterMode(display=False) as plain, torch.no_grad():
+        core(x, t, r, cached)
+    with FlopCounterMode(display=False) as differentiated:
+        jvp(lambda x, t: core(x, t, r, cached), (x, t), (x, torch.ones_like(t)))
+    assert 2.0 <= differentiated.get_total_flops() / plain.get_total_flops() < 2.2
+
+
+@each_core
+@pytest.mark.parametrize("residual", ["attnres-sum", "block-sum"])
+def test_fresh_attention_residuals_equal_the_standard_pre_norm_network(residual, conditioning):
+    standard = make_core("standard", conditioning)
+    attnres = make_core(residual, conditioning)
     attnres.load_state_dict(standard.state_dict(), strict=False)
     nn.init.zeros_(attnres.residual.query)
     for module in (*attnres.modules(), *standard.modules()):
@@ -76,10 +101,11 @@ def test_fresh_attention_residuals_equal_the_standard_pre_norm_network():
     )
 
 
-@pytest.mark.parametrize("residual", RESIDUALS)
-def test_cached_context_equals_one_joint_pass(residual):
+@each_core
+@each_residual
+def test_cached_context_equals_one_joint_pass(residual, conditioning):
     """The prefix does not see the suffix: running it for each row alone or once for several draws is the same."""
-    core = make_core(residual)
+    core = make_core(residual, conditioning)
     x, t, r, context = inputs()
     cached = core.condition(context)
     twice = cached.repeat(2)
@@ -89,6 +115,15 @@ def test_cached_context_equals_one_joint_pass(residual):
     )
     torch.testing.assert_close(many[::2], one)
     torch.testing.assert_close(many[1::2], one)
+
+
+@each_core
+def test_the_context_matters(conditioning):
+    core = make_core("attnres-sum", conditioning)
+    x, t, r, context = inputs()
+    changed = context.clone()
+    changed[:, -1] += 1.0  # of the summary alone, which every core reads
+    assert not torch.allclose(core(x, t, r, core.condition(context)), core(x, t, r, core.condition(changed)))
 
 
 def test_the_derivative_is_taken_in_full_precision_under_autocast():
@@ -104,8 +139,10 @@ def test_the_derivative_is_taken_in_full_precision_under_autocast():
         assert torch.equal(derivative(), exact)
 
 
-def test_every_parameter_learns():
-    core = make_core("attnres-attn")
+@each_core
+@pytest.mark.parametrize("residual", ["standard", "attnres-attn", "block-attn"])
+def test_every_parameter_learns(residual, conditioning):
+    core = make_core(residual, conditioning)
     x, t, r, context = inputs()
     core(x, t, r, core.condition(context)).square().sum().backward()
     assert [name for name, p in core.named_parameters() if p.grad is None or not p.grad.any()] == []
