@@ -16,6 +16,7 @@ from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.horizon import Horizon
+from imfvla.nn.pretrained import initialise_from_pretrained
 from imfvla.options import build, require
 from imfvla.policy import build_policy
 from imfvla.reporting.table_row import print_row
@@ -49,6 +50,8 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     evaluation = build(EvaluationOptions, config["evaluation"], "evaluation")
     build(Horizon, config["horizon"], "horizon")
     policy = build_policy(config)  # what does not fit together is told before demonstrations are collected
+    if not run.last_state.exists() and training.steps not in run.weight_steps():
+        initialise_from_pretrained(policy)
     for nfe in evaluation.nfe:
         policy.generator.check_nfe(nfe)
     seed = config["seed"]
@@ -84,6 +87,8 @@ def _train(
     initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
     policy = build_policy(config, windows.statistics())
+    if not run.last_state.exists():  # a state has the weights, and their file may be gone
+        initialise_from_pretrained(policy)
     num_parameters = sum(parameter.numel() for parameter in policy.parameters())
     log.info(f"{len(windows)} training items, {num_parameters / 1e6:.2f} M parameters")
     trainer = Trainer(

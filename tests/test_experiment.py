@@ -146,3 +146,34 @@ def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anyth
         run_experiment(compose("train", [*TINY, "generator=l1"]), run)
     assert calls == []
     assert not run.status()
+
+
+def test_pretrained_weights_are_read_where_a_training_begins_and_never_again(calls, tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(experiment, "initialise_from_pretrained", read.append)
+    original = experiment.Trainer._update
+
+    def interrupted(trainer, batch):
+        if trainer.step == 3:
+            raise KeyboardInterrupt
+        return original(trainer, batch)
+
+    config, run = compose("train", TINY), RunDirectory(tmp_path / "run")
+    with monkeypatch.context() as patched:
+        patched.setattr(experiment.Trainer, "_update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment(config, run)
+    assert len(read) == 2  # to be told early what does not fit, and to train
+    run_experiment(config, run)
+    run.last_state.unlink()
+    run_experiment(config, run)
+    assert run.status()["state"] == DONE
+    assert len(read) == 2
+
+
+def test_foreign_weights_are_told_before_anything_is_written(calls, tmp_path):
+    overrides = ["encoder=resnet18", f"encoder.vision.pretrained={tmp_path}/resnet18.pth"]
+    with pytest.raises(UserError, match=r"encoder\.vision\.pretrained must be null or a \.safetensors file"):
+        run_experiment(compose("train", [*TINY, *overrides]), RunDirectory(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    assert calls == []

@@ -5,11 +5,17 @@ import torch
 
 from imfvla.encoders.observation import ObservationEncoder
 from imfvla.encoders.tokens import AttendedTokens, GridTokens
-from imfvla.encoders.vision import CompactCNN, ResNet18
+from imfvla.encoders.vision import CompactCNN, CompactResNet, ResNet18
 from imfvla.instruction import tokenize
 from imfvla.types import Observation
 
-TRUNKS = {"compact": lambda: CompactCNN((16, 16), 8), "resnet18": ResNet18}
+TRUNKS = {
+    "compact": lambda: CompactCNN((16, 16), 8),
+    "compact_resnet": lambda: CompactResNet((16, 16), 8, num_blocks=2, residual="standard"),
+    "compact_attnres": lambda: CompactResNet((16, 16), 8, num_blocks=2, residual="attention"),
+    "resnet18": ResNet18,
+    "resnet18_attnres": lambda: ResNet18("attention"),
+}
 TOKENS = {
     "grid": partial(GridTokens, tokens=2),
     "attended": partial(AttendedTokens, tokens=2, maps=4, features=3),

@@ -1,0 +1,87 @@
+"""Weights that others trained, from a local safetensors file: read once, when a training begins from nothing.
+
+A part with such weights has a method `initialise_from_pretrained`; building it reads no file, so that a checkpoint,
+which has the weights, can be used where the file is gone. Pickles are never read: they can run code.
+"""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from imfvla.errors import UserError
+
+SHOWN = 4  # names of one kind in a message
+
+
+@runtime_checkable
+class Pretrained(Protocol):
+    """A part of a policy that can take weights from a file."""
+
+    def initialise_from_pretrained(self) -> None:
+        """Takes them, where a file is configured. Raises UserError where it does not fit."""
+        ...
+
+
+def initialise_from_pretrained(model: nn.Module) -> None:
+    """Lets every part of `model` take its pretrained weights."""
+    for module in model.modules():
+        if isinstance(module, Pretrained):
+            module.initialise_from_pretrained()
+
+
+def read_weights(path: str | Path, key: str) -> dict[str, Tensor]:
+    """The tensors of a safetensors file on the CPU. Raises UserError, under the config `key`, where it is not one."""
+    path = Path(str(path)).expanduser()
+    if path.suffix != ".safetensors":
+        raise UserError(
+            f"{key} must be null or a .safetensors file, found {str(path)!r}: convert a state_dict with "
+            f"safetensors.torch.save_file(torch.load({path.name!r}, weights_only=True), "
+            f"{path.stem + '.safetensors'!r}); pickles are not read here."
+        )
+    try:
+        return load_file(path)
+    except FileNotFoundError:
+        raise UserError(
+            f"{key} names {path}, which is not there: correct the path, or take null to begin with random weights."
+        ) from None
+    except (SafetensorError, OSError) as error:
+        raise UserError(
+            f"{key} names {path}, which cannot be read as safetensors ({error}): restore the file."
+        ) from error
+
+
+def take_weights(
+    parameters: Mapping[str, Tensor], found: Mapping[str, Tensor], ignored: Collection[str], where: str
+) -> None:
+    """Copies `found` into the `parameters` of the same names; all of them or, at a misfit, none.
+
+    `ignored` names may be found and are not used. Raises UserError, which begins with `where`, that says which names
+    are missing, foreign or of another shape.
+    """
+    faults = []
+    if missing := parameters.keys() - found.keys():
+        faults.append(f"missing {_listed(missing)}")
+    if foreign := found.keys() - parameters.keys() - set(ignored):
+        faults.append(f"foreign {_listed(foreign)}")
+    misshapen = {
+        f"{name} {tuple(found[name].shape)} for {tuple(parameter.shape)}"
+        for name, parameter in parameters.items()
+        if name in found and found[name].shape != parameter.shape
+    }
+    if misshapen:
+        faults.append(f"ill-shaped {_listed(misshapen)}")
+    if faults:
+        raise UserError(f"{where}: {'; '.join(faults)}.")
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(found[name])
+
+
+def _listed(names: Collection[str]) -> str:
+    shown = ", ".join(sorted(names)[:SHOWN])
+    return f"{shown} and {len(names) - SHOWN} more" if len(names) > SHOWN else shown
