@@ -1,5 +1,6 @@
-"""Every experiment file composes and builds at both scales, and takes a step on tiny data at the CPU's."""
+"""Every experiment trains, resumes and is evaluated on tiny data at scale=cpu, and takes a step at scale=paper."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +10,23 @@ from synthetic import write_demonstrations
 
 from imfvla.composition import CONFIG_DIRECTORY, compose
 from imfvla.errors import UserError
+from imfvla.evaluation import evaluate
 from imfvla.options import build
 from imfvla.policy import build_policy
+from imfvla.reporting.paper import paper_rows
 from imfvla.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
+from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
 
 EXPERIMENTS = sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
 TINY = [
     "observation.image_size=[32,32]",
     "training.batch_size=2",
-    "training.steps=1",
+    "training.steps=2",
     "training.checkpoints=1",
+    "training.save_every_s=0",
     "training.threads=1",
 ]
 
@@ -31,38 +36,76 @@ def demonstrations(tmp_path_factory) -> Path:
     return write_demonstrations(tmp_path_factory.mktemp("recorded") / "demonstrations", num_episodes=2)
 
 
-def test_both_tables_have_their_experiment():
-    assert {"socket_ph32_exec16", "transfer_ph32_exec16"} <= set(EXPERIMENTS)
+def test_every_row_of_the_tables_has_its_experiment():
+    assert {row.experiment for row in paper_rows()} <= set(EXPERIMENTS)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_steps_once(experiment, demonstrations, tmp_path):
+def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, tmp_path, monkeypatch):
     config = compose("train", [f"+exp={experiment}", *TINY])
     windows = prepare_windows(config, demonstrations)
-    policy = build_policy(config, windows.statistics())
-    options = build(TrainingOptions, config["training"], "training")
-    optim = build(OptimOptions, config["optim"], "optim")
     run = RunDirectory(tmp_path)
-    before = [parameter.detach().clone() for parameter in policy.parameters()]
-    Trainer(
-        policy, make_loader(config, windows), run, options, optim, seed=config["seed"], description={}
-    ).train()
-    assert run.weight_steps() == [1]
-    after = list(policy.parameters())
-    assert all(parameter.isfinite().all() for parameter in after)
-    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    run.claim(config)
+
+    def trainer() -> Trainer:
+        torch.manual_seed(0)
+        return Trainer(
+            build_policy(config, windows.statistics()),
+            make_loader(config, windows),
+            run,
+            build(TrainingOptions, config["training"], "training"),
+            build(OptimOptions, config["optim"], "optim"),
+            seed=config["seed"],
+            description={},
+        )
+
+    first = trainer()
+    before = {name: parameter.detach().clone() for name, parameter in first.policy.named_parameters()}
+    take_step = first._update
+    monkeypatch.setattr(first, "_update", lambda batch: interrupt() if first.step else take_step(batch))
+    with pytest.raises(KeyboardInterrupt):
+        first.train()
+    second = trainer()
+    assert second.step == 1
+    second.train()
+    after = dict(second.policy.named_parameters())
+    assert all(parameter.isfinite().all() for parameter in after.values())
+    assert any(not torch.equal(before[name], parameter) for name, parameter in after.items())
+
+    (summary,) = evaluate(
+        run,
+        episodes=1,
+        first_seed=0,
+        nfe=config["evaluation"]["nfe"][:1],
+        workers=0,
+        max_steps=2,
+        recordings=False,
+    )
+    assert summary["checkpoint_step"] == 2
+    assert not any(summary["failures"].values())
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_builds_at_the_paper_s_scale(experiment):
+def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations):
+    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), demonstrations)
     config = compose("train", [f"+exp={experiment}", "scale=paper"])
     build(TrainingOptions, config["training"], "training")
-    build(OptimOptions, config["optim"], "optim")
-    with torch.device("meta"):
-        policy = build_policy(config)
-    num_parameters = sum(parameter.numel() for parameter in policy.parameters())
-    assert num_parameters > 5e6
-    assert policy.noise_shape == (config["horizon"]["pred"], config["action_dim"])
+    policy = build_policy(config, tiny.statistics())
+    assert sum(parameter.numel() for parameter in policy.parameters()) > 5e6
+    optimiser = make_optimiser(policy, build(OptimOptions, config["optim"], "optim"))
+    batch = tiny.batch(np.arange(1), np.random.default_rng(0))
+    height, width = config["observation"]["image_size"]
+    images = torch.randint(256, (*batch.obs.images.shape[:-2], height, width), dtype=torch.uint8)
+    batch = replace(batch, obs=replace(batch.obs, images=images))
+    loss, _ = policy.loss(batch, torch.Generator().manual_seed(0))
+    loss.backward()
+    optimiser.step()
+    assert loss.isfinite()
+    assert all(parameter.isfinite().all() for parameter in policy.parameters())
 
 
 def test_exec_beyond_pred_is_refused():
