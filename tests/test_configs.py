@@ -13,7 +13,7 @@ from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.options import build
 from imfvla.policy import build_policy
-from imfvla.reporting.paper import paper_rows
+from imfvla.reporting.mapping import read_mapping
 from imfvla.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
@@ -37,7 +37,7 @@ def demonstrations(tmp_path_factory) -> Path:
 
 
 def test_every_row_of_the_tables_has_its_experiment():
-    assert {row.experiment for row in paper_rows()} <= set(EXPERIMENTS)
+    assert {row.experiment for row in read_mapping().rows} <= set(EXPERIMENTS)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

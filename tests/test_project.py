@@ -88,7 +88,7 @@ MAY_IMPORT = {
     "policy": {"torch", "chunks", "generators", "horizon", "nn", "statistics", "types"},
     "tasks": {"mujoco", "dm_control", "episode", "gl"},
     "recording": {"episode"},
-    "reporting": {"episode", "files", "run_directory"},
+    "reporting": {"episode", "files", "options", "run_directory"},
     "data": {"torch", "horizon", "instruction", "recording", "statistics", "types"},
 }
 

@@ -1,4 +1,4 @@
-"""The paper's printed tables, from `experiments/paper`."""
+"""The paper's printed tables, from `experiments/paper`. Which run answers a row is `mapping.py`'s."""
 
 import csv
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 DIRECTORY = Path(__file__).resolve().parents[2] / "experiments" / "paper"
-TABLES = (1, 2)  # rows of experiments; table 3 compares them
+TABLES = (1, 2)  # rows of methods; table 3 compares them
 TITLES = {
     1: "Table 1: socket peg insertion",
     2: "Table 2: object transfer",
@@ -16,11 +16,9 @@ TITLES = {
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One printed row of Table 1 or 2; `nfe` is our reading where the paper does not say it."""
+    """One printed row of Table 1 or 2."""
 
     table: int
-    experiment: str
-    nfe: int
     method: str
     setting: str
     avg_reward: float
@@ -32,20 +30,24 @@ class PaperRow:
     latency_ms: float | None  # printed in Table 1 only
     inference_fps: float | None  # printed in Table 2 only
 
+    @property
+    def label(self) -> str:
+        """Unique within its table."""
+        return f"{self.method} ({self.setting})"
+
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """One printed row of Table 3: `column` of a row against that of its baseline."""
+class PaperComparison:
+    """One printed row of Table 3; `result` is the text as printed."""
 
-    experiment: str
-    nfe: int
-    baseline: str
-    baseline_nfe: int
-    column: str  # a field of PaperRow
-    operation: str  # ratio | inverse_ratio | difference
     comparison: str
     metric: str
-    result: str  # as printed
+    result: str
+
+    @property
+    def label(self) -> str:
+        """Unique within Table 3."""
+        return f"{self.comparison}, {self.metric}"
 
 
 @cache
@@ -55,17 +57,9 @@ def paper_rows() -> tuple[PaperRow, ...]:
 
 
 @cache
-def comparisons() -> tuple[Comparison, ...]:
+def paper_comparisons() -> tuple[PaperComparison, ...]:
     """The rows of Table 3 in the paper's order."""
-    return tuple(
-        Comparison(**{**line, "nfe": int(line["nfe"]), "baseline_nfe": int(line["baseline_nfe"])})
-        for line in _lines(3)
-    )
-
-
-def paper_row(experiment: str, nfe: int) -> PaperRow | None:
-    """The printed row of an experiment, None where the paper has none."""
-    return next((row for row in paper_rows() if (row.experiment, row.nfe) == (experiment, nfe)), None)
+    return tuple(PaperComparison(**line) for line in _lines(3))
 
 
 def _lines(table: int) -> list[dict[str, str]]:
@@ -78,8 +72,6 @@ def _row(table: int, line: dict[str, str]) -> PaperRow:
     success, _ = (int(part) for part in line["success"].split("/"))
     return PaperRow(
         table=table,
-        experiment=line["experiment"],
-        nfe=int(line["nfe"]),
         method=line["method"],
         setting=line["setting"],
         avg_reward=float(line["avg_reward"]),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.reporting.paper import PaperRow, paper_row
+from imfvla.reporting.mapping import Row, read_mapping, run_key
 from imfvla.run_directory import RunDirectory
 
 REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are demonstrations and selection
@@ -21,16 +21,31 @@ DESCRIPTION = ("experiment", "nfe", "checkpoint_step", "seeds", "protocol", "fin
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """One finished evaluation of a run, and the paper's row of the same experiment where it has one."""
+    """One finished evaluation of a run."""
 
     run: Path
     folder: Path
     summary: dict[str, Any]  # `summary.json`, every metric in it
-    paper: PaperRow | None
+    config: dict[str, Any]  # `config.yaml` of the run
+
+    @property
+    def experiment(self) -> str:
+        return self.summary["experiment"]
 
     @property
     def nfe(self) -> int:
         return self.summary["nfe"]
+
+    @property
+    def key(self) -> str:
+        """The overrides in the name of the run directory, its training seed apart; "" for none."""
+        name = self.run.resolve().name
+        return "" if name == self.experiment else run_key(name)
+
+    @property
+    def row(self) -> Row | None:
+        """The row of the tables with the same policy and nfe, of whichever checkpoint."""
+        return read_mapping().find(self.experiment, self.key, self.nfe)
 
     @property
     def is_reporting(self) -> bool:
@@ -41,9 +56,9 @@ class Evaluation:
 
 def evaluations(run: RunDirectory) -> list[Evaluation]:
     """All finished evaluations of a run, by folder name. Raises UserError for a broken summary."""
-    experiment = run.config().get("name", "")
+    config = run.config()
     folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
-    return [_read(run, folder, experiment) for folder in folders]
+    return [_read(run, folder, config) for folder in folders]
 
 
 def rows(run: RunDirectory) -> list[Evaluation]:
@@ -80,7 +95,7 @@ def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:
     return evaluation.is_reporting, summary["checkpoint_step"], summary["episodes"]
 
 
-def _read(run: RunDirectory, folder: Path, experiment: str) -> Evaluation:
+def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
@@ -91,4 +106,4 @@ def _read(run: RunDirectory, folder: Path, experiment: str) -> Evaluation:
         ) from error
     if missing:
         raise UserError(f"{path} lacks {', '.join(missing)}: evaluate again with overwrite=true.")
-    return Evaluation(run.path, folder, summary, paper_row(experiment, summary["nfe"]))
+    return Evaluation(run.path, folder, summary, config)

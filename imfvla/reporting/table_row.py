@@ -7,6 +7,7 @@ from typing import Any
 from rich.console import Console
 
 from imfvla.files import write_json, write_text
+from imfvla.reporting.mapping import LAST
 from imfvla.reporting.metrics import wilson_interval
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.runs import METRICS, Evaluation, evaluations, rows
@@ -34,13 +35,13 @@ def print_row(run: RunDirectory, console: Console | None = None, *, only: Collec
 
 def table_of(found: Sequence[Evaluation]) -> Table:
     """Ours and the paper's rows of one run, in turn."""
-    summary, paper = found[0].summary, next((e.paper for e in found if e.paper), None)
-    where = f"Table {paper.table}" if paper else "no row in the paper"
+    summary, papers = found[0].summary, [paper_of(evaluation) for evaluation in found]
+    where = next((f"Table {paper.table}" for paper in papers if paper), "no row in the paper")
     cells = []
-    for evaluation in found:
+    for evaluation, paper in zip(found, papers, strict=True):
         cells.append((str(evaluation.nfe), "ours", *ours(evaluation.summary)))
-        if evaluation.paper is not None:
-            cells.append((str(evaluation.nfe), "paper", *printed(evaluation.paper)))
+        if paper is not None:
+            cells.append((str(evaluation.nfe), "paper", *printed(paper)))
     note = (
         f"Seeds {summary['seeds'][0]} to {summary['seeds'][1]}, weights of step {summary['checkpoint_step']}, "
         f"{summary['protocol']['task']} ({summary['protocol']['variant']}); {machine(summary)}. "
@@ -49,9 +50,16 @@ def table_of(found: Sequence[Evaluation]) -> Table:
     if not all(evaluation.is_reporting for evaluation in found):
         note += " Not all rows are whole episodes of the reporting band."
     for evaluation in found:
+        if paper_of(evaluation) and evaluation.row.checkpoint != LAST:
+            note += f" The paper's row of nfe {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
         for label, count in evaluation.summary["failures"].items():
             note += f" Nfe {evaluation.nfe}: {count} ended as failed, {label}."
     return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), note)
+
+
+def paper_of(evaluation: Evaluation) -> PaperRow | None:
+    """The printed row with the same policy and nfe."""
+    return evaluation.row.paper if evaluation.row else None
 
 
 def ours(summary: dict[str, Any]) -> tuple[str, ...]:
@@ -101,11 +109,12 @@ def machine(summary: dict[str, Any]) -> str:
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
     """One row for scripts: our metrics and the paper's row, null where it has none."""
+    paper = paper_of(evaluation)
     return {
         "experiment": evaluation.summary["experiment"],
         "nfe": evaluation.nfe,
         "checkpoint_step": evaluation.summary["checkpoint_step"],
         "seeds": evaluation.summary["seeds"],
         "ours": {key: evaluation.summary[key] for key in METRICS},
-        "paper": asdict(evaluation.paper) if evaluation.paper else None,
+        "paper": asdict(paper) if paper else None,
     }

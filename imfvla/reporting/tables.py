@@ -5,13 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imfvla.files import write_text
-from imfvla.reporting.paper import TITLES, Comparison, PaperRow, comparisons, paper_row, paper_rows
+from imfvla.reporting.mapping import Comparison, Row, read_mapping
+from imfvla.reporting.paper import TITLES, PaperRow
 from imfvla.reporting.runs import Evaluation, rows
 from imfvla.reporting.table import NOTHING, Table
 from imfvla.reporting.table_row import COLUMNS, ours, printed
 from imfvla.run_directory import RunDirectory
 
 Ours = dict[tuple[str, int], Evaluation]  # label and nfe -> the evaluation that stands for it
+PRINTED = {  # compared metric -> field of a printed row
+    "avg_return": "avg_reward",
+    "success_episodes": "success",
+    "inference_ms_mean": "latency_ms",
+    "inference_fps": "inference_fps",
+}
 log = logging.getLogger(__name__)
 
 
@@ -37,7 +44,8 @@ def tables(found: Ours) -> dict[str, Table]:
     """File stem -> table: the paper's three, and the rows of ours that the paper does not have."""
     named = {f"table{number}": _paper_table(number, found) for number in (1, 2)}
     named["table3"] = _comparison_table(found)
-    others = {key: evaluation for key, evaluation in found.items() if paper_row(*key) is None}
+    known = {_key(row) for row in read_mapping().rows}
+    others = {key: evaluation for key, evaluation in found.items() if key not in known}
     if others:
         cells = tuple(
             (experiment, str(nfe), "ours", *ours(evaluation.summary))
@@ -58,39 +66,37 @@ def write(named: dict[str, Table], directory: Path) -> list[Path]:
 
 
 def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
-    """A result of Table 3 from two rows, as the paper prints it: "1.76×" or "+15"."""
-    value, against = getattr(row, comparison.column), getattr(baseline, comparison.column)
-    return _result(comparison.operation, value, against)
+    """A result of Table 3 from two printed rows, as the paper prints it: "1.76×" or "+15"."""
+    column = PRINTED[comparison.of]
+    return _result(comparison.operation, getattr(row, column), getattr(baseline, column))
+
+
+def _key(row: Row) -> tuple[str, int]:
+    return (f"{row.experiment}/{row.run}" if row.run else row.experiment), row.nfe
 
 
 def _paper_table(number: int, found: Ours) -> Table:
     cells = []
-    for row in paper_rows():
-        if row.table == number:
-            name = f"{row.method} ({row.setting})"
-            cells.append((name, str(row.nfe), "paper", *printed(row)))
-            if (row.experiment, row.nfe) in found:
-                summary = found[row.experiment, row.nfe].summary
-                cells.append((row.experiment, str(row.nfe), "ours", *ours(summary)))
+    for row in read_mapping().of_table(number):
+        if row.paper:
+            cells.append((row.label, str(row.nfe), "paper", *printed(row.paper)))
+        if _key(row) in found:
+            cells.append((row.experiment, str(row.nfe), "ours", *ours(found[_key(row)].summary)))
     note = "Our rows stand below the paper's of the same experiment; where none stands, it has not been run here."
     return Table(TITLES[number], ("Experiment", *COLUMNS), tuple(cells), note)
 
 
 def _comparison_table(found: Ours) -> Table:
     cells = []
-    for comparison in comparisons():
-        row = found.get((comparison.experiment, comparison.nfe))
-        baseline = found.get((comparison.baseline, comparison.baseline_nfe))
+    for comparison in read_mapping().comparisons:
+        row, baseline = found.get(_key(comparison.row)), found.get(_key(comparison.baseline))
         result = NOTHING
         if row and baseline and row.summary["episodes"] == baseline.summary["episodes"]:
-            key = {
-                "avg_reward": "avg_return",
-                "success": "success_episodes",
-                "latency_ms": "inference_ms_mean",
-            }
-            name = key.get(comparison.column, comparison.column)
-            result = _result(comparison.operation, row.summary[name], baseline.summary[name])
-        cells.append((comparison.comparison, comparison.metric, comparison.result, result))
+            result = _result(
+                comparison.operation, row.summary[comparison.of], baseline.summary[comparison.of]
+            )
+        paper = comparison.paper
+        cells.append((paper.comparison, paper.metric, paper.result, result))
     return Table(TITLES[3], ("Comparison", "Metric", "Paper", "Ours"), tuple(cells))
 
 
