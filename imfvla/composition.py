@@ -21,19 +21,10 @@ from omegaconf.errors import OmegaConfBaseException
 import imfvla
 from imfvla.errors import UserError
 from imfvla.options import suggestion
+from imfvla.run_directory import EXECUTION_KEYS
 
 CONFIG_DIRECTORY = Path(imfvla.__file__).resolve().parents[1] / "conf"
 VERSION_BASE = "1.3"
-# Overrides that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
-EXECUTION_KEYS = (
-    "evaluation",
-    "demos.workers",
-    "demos.directory",
-    "training.threads",
-    "training.prefetch",
-    "training.log_every",
-    "training.save_every_s",
-)
 MAX_RUN_NAME = 120
 
 

@@ -14,6 +14,7 @@ import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,16 @@ from imfvla.errors import UserError
 from imfvla.files import write_json, write_text
 
 RUNNING, DONE, FAILED = "running", "done", "failed"
+# Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
+EXECUTION_KEYS = (
+    "evaluation",
+    "demos.workers",
+    "demos.directory",
+    "training.threads",
+    "training.prefetch",
+    "training.log_every",
+    "training.save_every_s",
+)
 
 
 class RunDirectory:
@@ -60,7 +71,10 @@ class RunDirectory:
         return sorted(int(match.group(1)) for match in found if match)
 
     def policy_weights(self, step: int | str = "last") -> Path:
-        """`policy.safetensors` of a step, or of the last one kept. Raises UserError where there is none."""
+        """`policy.safetensors` of a step, of the last one kept, or of a share of the training such as "1/3".
+
+        Raises UserError where there is none.
+        """
         steps = self.weight_steps()
         if not steps:
             raise UserError(
@@ -68,6 +82,8 @@ class RunDirectory:
             )
         if step == "last":
             step = steps[-1]
+        elif re.fullmatch(r"[1-9]\d*/[1-9]\d*", str(step)):
+            step = round(self.training_steps() * Fraction(step))
         if step not in steps:
             kept = ", ".join(str(known) for known in steps)
             raise UserError(
@@ -87,6 +103,16 @@ class RunDirectory:
         if not isinstance(config, dict):
             raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
         return config
+
+    def training_steps(self) -> int:
+        """The steps of the whole training. Raises UserError where the config does not say them."""
+        training = self.config().get("training")
+        steps = training.get("steps") if isinstance(training, dict) else None
+        if not isinstance(steps, int) or steps < 1:
+            raise UserError(
+                f"{self.path}/config.yaml must have training.steps of at least 1, found {steps!r}."
+            )
+        return steps
 
     def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
         """Makes the directory this config's: writes config.yaml, or compares with the one that is there.

@@ -84,6 +84,17 @@ def test_weight_steps_are_those_that_are_whole(tmp_path):
     assert run.policy_weights(9).parent.name == "step-9"
 
 
+def test_weights_of_a_share_of_the_training(tmp_path):
+    run = RunDirectory(tmp_path)
+    (run.checkpoints / "step-9").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"not a run directory"):
+        run.policy_weights("1/3")
+    run.claim({"training": {"steps": 26}})
+    assert run.policy_weights("1/3").parent.name == "step-9"
+    with pytest.raises(UserError, match=r"no weights of step 17: kept are 9"):
+        run.policy_weights("2/3")
+
+
 def test_reading_creates_nothing(tmp_path):
     run = RunDirectory(tmp_path / "absent")
     assert run.weight_steps() == []
