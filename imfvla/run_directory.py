@@ -106,13 +106,7 @@ class RunDirectory:
 
     def training_steps(self) -> int:
         """The steps of the whole training. Raises UserError where the config does not say them."""
-        training = self.config().get("training")
-        steps = training.get("steps") if isinstance(training, dict) else None
-        if not isinstance(steps, int) or steps < 1:
-            raise UserError(
-                f"{self.path}/config.yaml must have training.steps of at least 1, found {steps!r}."
-            )
-        return steps
+        return training_steps(self.config(), self.path)
 
     def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
         """Makes the directory this config's: writes config.yaml, or compares with the one that is there.
@@ -163,6 +157,15 @@ class RunDirectory:
             file.write(str(os.getpid()))
             file.flush()
             yield
+
+
+def training_steps(config: Mapping[str, Any], run: Path) -> int:
+    """The steps of the whole training of a run with this config. Raises UserError where it does not say them."""
+    training = config.get("training")
+    steps = training.get("steps") if isinstance(training, Mapping) else None
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+        raise UserError(f"{run}/config.yaml must have training.steps of at least 1, found {steps!r}.")
+    return steps
 
 
 def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:

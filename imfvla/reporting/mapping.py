@@ -38,7 +38,7 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """A row of Table 1 or 2. `paper` is the printed row, None for a rival that the paper does not have."""
 
     name: str
@@ -71,8 +71,8 @@ class Row:
 class Comparison:
     """A row of Table 3: `of` of a row against that of its baseline, as one of OPERATIONS."""
 
-    row: Row
-    baseline: Row
+    row: TableRow
+    baseline: TableRow
     of: str  # one of COMPARED
     operation: str
     paper: PaperComparison
@@ -82,13 +82,13 @@ class Comparison:
 class Mapping:
     """The rows of Tables 1 and 2 and the comparisons of Table 3, each in its order."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     comparisons: tuple[Comparison, ...]
 
-    def of_table(self, table: int) -> tuple[Row, ...]:
+    def of_table(self, table: int) -> tuple[TableRow, ...]:
         return tuple(row for row in self.rows if row.table == table)
 
-    def find(self, experiment: str, run: str, nfe: int) -> Row | None:
+    def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
         """The first row of an experiment, a `run_key` and a number of evaluations, of whichever checkpoint."""
         wanted = (experiment, run, nfe)
         return next((row for row in self.rows if (row.experiment, row.run, row.nfe) == wanted), None)
@@ -151,7 +151,7 @@ def read_mapping(path: Path = PATH) -> Mapping:
     return Mapping(tuple(rows), tuple(comparisons))
 
 
-def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wanted) -> Row:
+def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wanted) -> TableRow:
     where = _where(entry, f"table{table}, row {number}", path)
     values = _plain(entry, where)
     wanted = replace(default)
@@ -170,7 +170,7 @@ def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wa
         paper = _named(read.paper, labels, f"{where}: unknown row of the paper's Table {table}")
     elif read.method is None or read.setting is None:
         raise UserError(f"{where} lacks paper, or else method and setting, which say what the row is.")
-    return Row(
+    return TableRow(
         name=read.name,
         table=table,
         experiment=read.experiment,
@@ -185,7 +185,7 @@ def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wa
     )
 
 
-def _comparison(entry: dict[str, Any], number: int, path: Path, rows: dict[str, Row]) -> Comparison:
+def _comparison(entry: dict[str, Any], number: int, path: Path, rows: dict[str, TableRow]) -> Comparison:
     where = _where(entry, f"table3, row {number}", path)
     values = _plain(entry, where)
     if "as" in values:  # a keyword in Python
@@ -203,8 +203,8 @@ def _comparison(entry: dict[str, Any], number: int, path: Path, rows: dict[str, 
     )
 
 
-def _check_rows(rows: Sequence[Row], path: Path) -> None:
-    seen: dict[str, Row] = {}
+def _check_rows(rows: Sequence[TableRow], path: Path) -> None:
+    seen: dict[str, TableRow] = {}
     for row in rows:
         if row.name in seen:
             raise UserError(f"{row.where}: the name {row.name} is taken by {seen[row.name].where}.")

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.reporting.mapping import Row, read_mapping, run_key
-from imfvla.run_directory import RunDirectory
+from imfvla.reporting.mapping import TableRow, read_mapping, run_key
+from imfvla.run_directory import RunDirectory, training_steps
 
 REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are demonstrations and selection
 METRICS = (
@@ -39,11 +39,29 @@ class Evaluation:
     @property
     def key(self) -> str:
         """The overrides in the name of the run directory, its training seed apart; "" for none."""
-        name = self.run.resolve().name
-        return "" if name == self.experiment else run_key(name)
+        return key_of(self.run, self.experiment)
 
     @property
-    def row(self) -> Row | None:
+    def label(self) -> str:
+        return f"{self.experiment}/{self.key}" if self.key else self.experiment
+
+    @property
+    def training_seed(self) -> int:
+        return self.config.get("seed", 0)
+
+    @property
+    def training_steps(self) -> int:
+        """Of the whole training. Raises UserError where the config does not say them."""
+        return training_steps(self.config, self.run)
+
+    @property
+    def seeds(self) -> range:
+        """Of the episodes."""
+        first, last = self.summary["seeds"]
+        return range(first, last + 1)
+
+    @property
+    def row(self) -> TableRow | None:
         """The row of the tables with the same policy and nfe, of whichever checkpoint."""
         return read_mapping().find(self.experiment, self.key, self.nfe)
 
@@ -54,15 +72,24 @@ class Evaluation:
         return whole and self.summary["seeds"][0] >= REPORTING_FIRST_SEED
 
 
-def evaluations(run: RunDirectory) -> list[Evaluation]:
-    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary."""
-    config = run.config()
+def key_of(run: Path, experiment: str) -> str:
+    """The overrides in the name of a run directory, as in `Evaluation.key`."""
+    name = run.resolve().name
+    return "" if name == experiment else run_key(name)
+
+
+def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
+    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary.
+
+    `config` spares reading it again.
+    """
+    config = run.config() if config is None else config
     folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
     return [_read(run, folder, config) for folder in folders]
 
 
 def rows(run: RunDirectory) -> list[Evaluation]:
-    """The evaluations that stand in tables, one for each nfe, ascending.
+    """The evaluations that stand for a run by itself, one for each nfe, ascending.
 
     Of several: whole episodes of the reporting band before others, then later weights, then more episodes.
 
@@ -81,13 +108,11 @@ def rows(run: RunDirectory) -> list[Evaluation]:
 
 
 def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
-    """Runs with a finished evaluation in or below the directories, in their order and by path within each."""
+    """Runs in or below the directories, finished or not, in their order and by path within each."""
     found: dict[Path, None] = {}
     for root in directories:
-        found |= dict.fromkeys(
-            path.parents[2] for path in sorted(Path(root).glob("**/rollouts/*/summary.json"))
-        )
-    return [RunDirectory(path) for path in found if (path / "config.yaml").exists()]
+        found |= dict.fromkeys(path.parent for path in sorted(Path(root).glob("**/config.yaml")))
+    return [RunDirectory(path) for path in found]
 
 
 def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:

@@ -1,4 +1,4 @@
-"""A table as text cells, written for people, for Markdown and for spreadsheets."""
+"""A table as text cells, written for people, for Markdown, LaTeX and spreadsheets."""
 
 import csv
 import io
@@ -13,17 +13,23 @@ from rich.text import Text
 
 WIDE = 160  # characters a line where no terminal says how many it has
 NOTHING = "-"
-NUMERIC = r"-|[-+]?[\d.]+[-/%×\d.]*"  # a dash, a number, a count of so many, an interval
+MISSING = "missing"
+VALUE = r"[-+<]?[\d.]+(?:/\d+)?[%×]?"  # a number, a count of so many, a share, a ratio, a bound
+NUMERIC = rf"{NOTHING}|{MISSING}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?"  # alone or with its interval
+LATEX = {
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
+    "×": r"$\times$", "≥": r"$\geq$", "≤": r"$\leq$", "±": r"$\pm$", "–": "--", "'": r"\textquotesingle{}",
+} | {character: f"\\{character}" for character in "&%$#_{}"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Title, column names, rows of as many cells, and a note below."""
+    """Title, column names, rows of as many cells, and paragraphs below."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         assert all(len(row) == len(self.columns) for row in self.rows), self.title
@@ -34,7 +40,7 @@ class Table:
         body = "\n".join(
             "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
         )
-        return f"## {self.title}\n\n{body}\n" + (f"\n{self.note}\n" if self.note else "")
+        return "\n".join((f"## {self.title}", "", body, "", *(f"{note}\n" for note in self.notes)))
 
     def csv(self) -> str:
         """Comma-separated values, names first."""
@@ -43,16 +49,34 @@ class Table:
         writer.writerows([self.columns, *self.rows])
         return stream.getvalue()
 
+    def latex(self) -> str:
+        """A floating table for the packages booktabs and graphicx, scaled to the width of the text."""
+        columns = "".join("r" if self.is_numeric(name) else "l" for name in self.columns)
+        lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (self.columns, *self.rows)]
+        notes = [rf"\par\smallskip\footnotesize {latex_text(note)}" for note in self.notes]
+        return "\n".join(
+            (
+                r"\begin{table*}", r"\centering", rf"\caption{{{latex_text(self.title)}}}",
+                rf"\resizebox{{\textwidth}}{{!}}{{\begin{{tabular}}{{{columns}}}", r"\toprule", lines[0], r"\midrule",
+                *lines[1:], r"\bottomrule", r"\end{tabular}}", *notes, r"\end{table*}", "",
+            )
+        )  # fmt: skip
+
+    def is_numeric(self, name: str) -> bool:
+        """Whether all cells of a column are numbers, with or without interval, or say that there is none."""
+        index = self.columns.index(name)
+        return all(re.fullmatch(NUMERIC, row[index]) for row in self.rows)
+
     def print(self, console: Console | None = None) -> None:
         """To the terminal, or to `console`."""
         if console is None:
             console = Console(width=None if sys.stdout.isatty() else WIDE)
-        title, note = Text(self.title, "bold"), Text(self.note) if self.note else None
+        title, note = Text(self.title, "bold"), Text("\n".join(self.notes)) if self.notes else None
         table = RichTable(
             title=title, caption=note, box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left"
         )
         for name in self.columns:
-            table.add_column(name, justify="right" if _is_numeric(name, self) else "left", overflow="fold")
+            table.add_column(name, justify="right" if self.is_numeric(name) else "left", overflow="fold")
         for row in self.rows:
             table.add_row(*map(Text, row))
         console.print(table)
@@ -63,6 +87,6 @@ def number(value: float | None, digits: int) -> str:
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 
-def _is_numeric(name: str, table: Table) -> bool:
-    index = table.columns.index(name)
-    return all(re.fullmatch(NUMERIC, row[index]) for row in table.rows)
+def latex_text(text: str) -> str:
+    """Plain text for LaTeX: its special characters escaped, signs outside of ASCII as commands."""
+    return "".join(LATEX.get(character, character) for character in text)

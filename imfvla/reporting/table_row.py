@@ -54,7 +54,7 @@ def table_of(found: Sequence[Evaluation]) -> Table:
             note += f" The paper's row of nfe {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
         for label, count in evaluation.summary["failures"].items():
             note += f" Nfe {evaluation.nfe}: {count} ended as failed, {label}."
-    return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), note)
+    return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), (note,))
 
 
 def paper_of(evaluation: Evaluation) -> PaperRow | None:

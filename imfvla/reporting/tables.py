@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imfvla.files import write_text
-from imfvla.reporting.mapping import Comparison, Row, read_mapping
+from imfvla.reporting.mapping import Comparison, TableRow, read_mapping
 from imfvla.reporting.paper import TITLES, PaperRow
-from imfvla.reporting.runs import Evaluation, rows
+from imfvla.reporting.runs import Evaluation, evaluations, rows
 from imfvla.reporting.table import NOTHING, Table
 from imfvla.reporting.table_row import COLUMNS, ours, printed
 from imfvla.run_directory import RunDirectory
@@ -26,7 +26,7 @@ def collect(runs: Sequence[RunDirectory]) -> Ours:
     """The evaluation of each experiment and nfe in the reporting band; of several runs, that of the last one."""
     found: Ours = {}
     for run in runs:
-        for evaluation in rows(run):
+        for evaluation in rows(run) if evaluations(run) else []:
             if not evaluation.is_reporting:
                 log.info("%s is left out: no whole episodes of the reporting band.", evaluation.folder)
                 continue
@@ -71,7 +71,7 @@ def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
     return _result(comparison.operation, getattr(row, column), getattr(baseline, column))
 
 
-def _key(row: Row) -> tuple[str, int]:
+def _key(row: TableRow) -> tuple[str, int]:
     return (f"{row.experiment}/{row.run}" if row.run else row.experiment), row.nfe
 
 
@@ -83,7 +83,7 @@ def _paper_table(number: int, found: Ours) -> Table:
         if _key(row) in found:
             cells.append((row.experiment, str(row.nfe), "ours", *ours(found[_key(row)].summary)))
     note = "Our rows stand below the paper's of the same experiment; where none stands, it has not been run here."
-    return Table(TITLES[number], ("Experiment", *COLUMNS), tuple(cells), note)
+    return Table(TITLES[number], ("Experiment", *COLUMNS), tuple(cells), (note,))
 
 
 def _comparison_table(found: Ours) -> Table:

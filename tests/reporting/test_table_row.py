@@ -145,7 +145,7 @@ def test_a_run_without_evaluation_is_named(tmp_path):
 
 
 def test_a_table_for_spreadsheets_and_markdown():
-    table = Table("Title", ("a", "b"), (("1, 2", "x|y"),), note="Note.")
+    table = Table("Title", ("a", "b"), (("1, 2", "x|y"),), notes=("Note.",))
     assert table.csv() == 'a,b\n"1, 2",x|y\n'
     assert table.markdown() == "## Title\n\n| a | b |\n| --- | --- |\n| 1, 2 | x\\|y |\n\nNote.\n"
 

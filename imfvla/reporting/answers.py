@@ -1,0 +1,205 @@
+"""Which evaluations answer the rows of the tables, and what to run where none does."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isclose
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.reporting.episodes import REMEDY, read_episodes
+from imfvla.reporting.mapping import LAST, Mapping, TableRow, Wanted
+from imfvla.reporting.metrics import Row, summarise
+from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
+from imfvla.run_directory import EXECUTION_KEYS, RunDirectory, differences, training_steps
+
+PROTOCOL = ("task", "variant", "noise_seed", "first_seed", "episodes", "max_steps", "device")
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluated:
+    """An evaluation with its episodes, in the order of their seeds."""
+
+    evaluation: Evaluation
+    episodes: tuple[Row, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What stands in a row of the tables: an evaluation for each training seed, ascending; none where it is missing."""
+
+    row: TableRow
+    evaluated: tuple[Evaluated, ...]
+    command: str  # that fills the row where it is missing
+
+    @property
+    def is_missing(self) -> bool:
+        return not self.evaluated
+
+
+class Sources:
+    """The runs below some directories. For a row, a later directory counts before an earlier one, alone."""
+
+    def __init__(self, directories: Sequence[Path]) -> None:
+        runs = [find_runs([Path(directory)]) for directory in directories]
+        self.configs = {run.path: run.config() for of_directory in runs for run in of_directory}
+        self.evaluations = [
+            [
+                found
+                for run in of_directory
+                for found in evaluations(run, self.configs[run.path])
+                if found.is_reporting
+            ]
+            for of_directory in runs
+        ]
+
+    def answer(self, row: TableRow, mapping: Mapping) -> Answer:
+        """The evaluations of a row.
+
+        Raises UserError, naming the row, where runs contradict each other or were evaluated in another way than the
+        row wants, and naming file and line where episodes are damaged.
+        """
+        others: list[Evaluation] = []
+        for found in reversed(self.evaluations):
+            candidates = [evaluation for evaluation in found if _is_of(evaluation, row)]
+            wanted = [evaluation for evaluation in candidates if _as_wanted(evaluation, row.wanted) is None]
+            others += [evaluation for evaluation in candidates if evaluation not in wanted]
+            if wanted:
+                wanted.sort(key=lambda evaluation: evaluation.training_seed)
+                _check_seeds(row, wanted)
+                return Answer(row, tuple(_read(evaluation) for evaluation in wanted), "")
+        command = self.command(row, mapping)
+        if others:
+            raise UserError(
+                f"{row.where} ({row.name}) wants another protocol than {others[0].folder} has, where "
+                f"{_as_wanted(others[0], row.wanted)}: {command}"
+            )
+        return Answer(row, (), command)
+
+    def command(self, row: TableRow, mapping: Mapping) -> str:
+        """What to run so that the row is filled."""
+        directory = f"runs/{row.experiment}/{','.join(sorted(row.overrides)) or 'default'}"
+        for path, config in reversed(self.configs.items()):
+            if _has_weights(path, config, row):
+                return _evaluate(row, path)
+        last = {
+            other.nfe
+            for other in mapping.rows
+            if (other.experiment, other.run, other.checkpoint) == (row.experiment, row.run, LAST)
+        }
+        overrides = "".join(f" {override}" for override in row.overrides)
+        counts = ",".join(map(str, sorted(last or {row.nfe})))
+        train = f"python -m imfvla.train +exp={row.experiment}{overrides} 'evaluation.nfe=[{counts}]'"
+        return train if row.checkpoint == LAST else f"{train} && {_evaluate(row, Path(directory))}"
+
+    def others(self, answers: Sequence[Answer]) -> list[Evaluated]:
+        """Evaluations of the reporting band that stand in no row, of a policy's several the last directory's."""
+        taken = {found.evaluation.folder for answer in answers for found in answer.evaluated}
+        answered = {_identity(found.evaluation) for answer in answers for found in answer.evaluated}
+        chosen: dict[tuple, Evaluation] = {}
+        for found in self.evaluations:
+            for evaluation in found:
+                identity = _identity(evaluation)
+                if evaluation.folder not in taken and identity not in answered:
+                    chosen[identity] = evaluation
+        return [_read(chosen[identity]) for identity in sorted(chosen)]
+
+
+def check_equal_protocols(answers: Sequence[Answer]) -> None:
+    """Raises UserError where rows of one table were not evaluated in the same way."""
+    every = [(answer.row, found) for answer in answers for found in answer.evaluated]
+    for (row, one), (other_row, other) in pairwise(every):
+        ours, theirs = one.evaluation.summary["protocol"], other.evaluation.summary["protocol"]
+        for key in PROTOCOL:
+            if ours.get(key) != theirs.get(key):
+                raise UserError(
+                    f"Table {row.table} mixes protocols: {key} is {ours.get(key)!r} in {one.evaluation.folder} "
+                    f"({row.where}) and {theirs.get(key)!r} in {other.evaluation.folder} ({other_row.where}); "
+                    "evaluate both in the same way."
+                )
+
+
+def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
+    """Whether it is of the row's policy, weights and number of evaluations."""
+    policy = (evaluation.experiment, evaluation.key, evaluation.nfe)
+    if policy != (row.experiment, row.run, row.nfe):
+        return False
+    return evaluation.summary["checkpoint_step"] == row.step(evaluation.training_steps)
+
+
+def _as_wanted(evaluation: Evaluation, wanted: Wanted) -> str | None:
+    """What differs from the wanted evaluation, None where nothing does."""
+    protocol = evaluation.summary["protocol"]
+    for key in Wanted.__slots__:
+        if protocol.get(key) != getattr(wanted, key):
+            return f"{key} is {protocol.get(key)!r}, not {getattr(wanted, key)!r}"
+    return None
+
+
+def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
+    """Several evaluations may stand in a row if they are of policies that differ in nothing but the training seed."""
+    for one, other in pairwise(found):
+        if one.training_seed == other.training_seed:
+            raise UserError(
+                f"{row.where} ({row.name}) is answered twice, by {one.folder} and {other.folder}: remove one, or "
+                "name directories=[...] that hold one of them."
+            )
+        differing = differences(one.config, other.config, ("seed", *EXECUTION_KEYS))
+        if differing:
+            raise UserError(
+                f"{row.where} ({row.name}) is answered by runs of different configs, {one.run} and {other.run}: "
+                f"{'; '.join(differing)}. Remove one."
+            )
+
+
+def _read(evaluation: Evaluation) -> Evaluated:
+    path = evaluation.folder / "episodes.jsonl"
+    episodes = read_episodes(path, evaluation.seeds)
+    for key, value in summarise(episodes).items():
+        told = evaluation.summary[key]
+        if not _equal(told, value):
+            raise UserError(
+                f"{path} gives {key} = {value!r}, summary.json beside it says {told!r}: one was changed; {REMEDY}."
+            )
+    return Evaluated(evaluation, episodes)
+
+
+def _equal(told: Any, value: Any) -> bool:
+    if isinstance(value, list) and isinstance(told, list):
+        return len(value) == len(told) and all(map(_equal, told, value))
+    if isinstance(value, float) and isinstance(told, int | float):
+        return isclose(told, value, rel_tol=1e-6)
+    return told == value
+
+
+def _has_weights(run: Path, config: dict[str, Any], row: TableRow) -> bool:
+    if config.get("name") != row.experiment or key_of(run, row.experiment) != row.run:
+        return False
+    return row.step(training_steps(config, run)) in RunDirectory(run).weight_steps()
+
+
+def _evaluate(row: TableRow, run: Path) -> str:
+    wanted = row.wanted
+    parts = [f"python -m imfvla.evaluate run={run} nfe={row.nfe}"]
+    if row.checkpoint != LAST:
+        parts.append(f"checkpoint={row.checkpoint}")
+    parts.append(f"first_seed={wanted.first_seed} episodes={wanted.episodes}")
+    if wanted.noise_seed:
+        parts.append(f"noise_seed={wanted.noise_seed}")
+    if wanted.device != "cpu":
+        parts.append(f"device={wanted.device}")
+    return " ".join(parts)
+
+
+def _identity(evaluation: Evaluation) -> tuple:
+    summary = evaluation.summary
+    return (
+        summary["protocol"]["task"],
+        evaluation.label,
+        evaluation.nfe,
+        summary["checkpoint_step"] == evaluation.training_steps,
+        evaluation.training_seed,
+        summary["seeds"][0],
+        summary["episodes"],
+    )

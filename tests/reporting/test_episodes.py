@@ -1,0 +1,82 @@
+"""Rows of episodes.jsonl: what was cut off, changed or mixed up is named with its line."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_runs import episodes_of
+
+from imfvla.errors import UserError
+from imfvla.reporting.episodes import read_episodes
+
+SEEDS = range(100_000, 100_004)
+ROWS = episodes_of(0.6, SEEDS[0], len(SEEDS), task="socket", latency_ms=5.0)
+TEXT = "".join(json.dumps(row) + "\n" for row in ROWS)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(TEXT)
+    return path
+
+
+def test_rows_come_in_the_order_of_their_seeds(path):
+    assert list(read_episodes(path, SEEDS)) == ROWS
+    path.write_text("".join(reversed(TEXT.splitlines(keepends=True))))
+    assert list(read_episodes(path, SEEDS)) == ROWS
+
+
+def changed(number: int, **values) -> str:
+    rows = [dict(row) for row in ROWS]
+    rows[number - 1] |= values
+    return "".join(json.dumps(row) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (TEXT[:-40], "line 4 is cut off before its end"),
+        (TEXT[:-1], "line 4 is cut off before its end"),
+        (TEXT.replace("{", "", 1), "line 1 is not JSON"),
+        ("[]\n" + TEXT, "line 1 must be a mapping"),
+        (TEXT.replace('"success"', '"succes"', 1), "line 1 lacks success"),
+        (changed(2, total_reward=float("nan")), "line 2: total_reward must be a finite number, found nan"),
+        (changed(2, total_reward="10"), "line 2: total_reward must be a finite number, found '10'"),
+        (changed(3, success=1), "line 3: success must be true or false, found 1"),
+        (changed(3, first_step_of_stage=[1.5]), "line 3: first_step_of_stage must hold whole numbers"),
+        (changed(3, timing={"wall_s": 1.0}), "line 3: timing must have wall_s and a list inference_ms"),
+        (changed(2, seed=7), "line 2 is of seed 7, its summary.json of 100000 to 100003"),
+        (changed(2, seed=100_000), "line 2 has the episode of seed 100000 for the second time"),
+        ("".join(TEXT.splitlines(keepends=True)[:3]), "line 3 is the last one, where 4 episodes were wanted"),
+        ("", "line 0 is the last one, where 4 episodes were wanted"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_line(path, text, message):
+    path.write_text(text)
+    with pytest.raises(UserError, match=message) as caught:
+        read_episodes(path, SEEDS)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_missing_or_no_text(path):
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(UserError, match="cannot be read"):
+        read_episodes(path, SEEDS)
+    path.unlink()
+    with pytest.raises(UserError, match=r"is missing beside its summary\.json"):
+        read_episodes(path, SEEDS)
+
+
+@given(st.integers(0, len(TEXT) - 1), st.binary(max_size=3))
+def test_damage_anywhere_is_a_user_error_or_harmless(tmp_path_factory, place, junk):
+    damaged = TEXT.encode()[:place] + junk + TEXT.encode()[place + len(junk) :]
+    path = tmp_path_factory.mktemp("damaged") / "episodes.jsonl"
+    path.write_bytes(damaged)
+    try:
+        assert len(read_episodes(path, SEEDS)) == len(SEEDS)
+    except UserError:
+        return
