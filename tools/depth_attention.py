@@ -1,0 +1,48 @@
+"""Plays one episode of a trained policy and writes what its Attention Residuals weigh, for the figures of make tables.
+
+python tools/depth_attention.py experiments/pretrained/socket_ph32_exec16
+
+Writes depth_attention.json into the run directory: the mean weights of each sublayer over all tokens and decisions.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from imfvla.depth_attention import measure_depth_attention
+from imfvla.errors import UserError
+from imfvla.files import write_json
+from imfvla.run_directory import RunDirectory
+from imfvla.workbench import load_workbench
+
+SELECTION_FIRST_SEED = 10_000
+FILE = "depth_attention.json"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path, help="directory of a trained run")
+    parser.add_argument("--checkpoint", default="last", help="training step of the weights, a share, or last")
+    parser.add_argument("--seed", type=int, default=SELECTION_FIRST_SEED, help="of the start state")
+    parser.add_argument("--nfe", type=int, default=1, help="evaluations of the network")
+    parser.add_argument("--max-steps", type=int, default=None, help="control steps, all of them by default")
+    arguments = parser.parse_args()
+    try:
+        directory = RunDirectory(arguments.run)
+        checkpoint = int(arguments.checkpoint) if arguments.checkpoint.isdecimal() else arguments.checkpoint
+        step = int(directory.policy_weights(checkpoint).parent.name.removeprefix("step-"))
+        env, policy = load_workbench(arguments.run, step)
+        found = measure_depth_attention(
+            env, policy, seed=arguments.seed, nfe=arguments.nfe, max_steps=arguments.max_steps
+        )
+        found = {"experiment": directory.config()["name"], "checkpoint_step": step, **found}
+        write_json(arguments.run / FILE, found)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(arguments.run / FILE)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
