@@ -89,6 +89,7 @@ MAY_IMPORT = {
     "tasks": {"mujoco", "dm_control", "episode", "gl"},
     "recording": {"episode"},
     "reporting": {"episode", "files", "options", "run_directory"},
+    "figures": {"reporting"},
     "data": {"torch", "horizon", "instruction", "recording", "statistics", "types"},
 }
 

@@ -1,0 +1,1 @@
+"""Figures of the paper, drawn with matplotlib from results and configurations. Needs neither torch nor mujoco."""

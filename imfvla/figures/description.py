@@ -1,0 +1,115 @@
+"""What a composed training config says about the method, in the words and numbers of its figures."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+VISION = {"CompactCNN": "compact CNN", "CompactResNet": "compact ResNet", "ResNet18": "ResNet18"}
+CORE = {
+    "TransformerCore": "one token sequence",
+    "CrossAttentionCore": "cross-attention to the context",
+    "AdaptiveNormCore": "adaptive norms (DiT)",
+}
+GENERATOR = {
+    "ImprovedMeanFlow": "improved Mean Flow",
+    "MeanFlow": "Mean Flow",
+    "FlowMatching": "flow matching",
+    "DenoisingDiffusion": "diffusion (DDPM)",
+    "Regression": "L1 regression",
+    "ActionChunking": "ACT",
+}
+TIMES = {
+    "HighNoiseTimes": "high-noise-biased times",
+    "UniformTimes": "uniform times",
+    "LogitNormalTimes": "logit-normal times",
+    "BetaTimes": "beta times",
+}
+STANDARD, ATTENTION, BLOCK = "standard", "attention", "block"
+RESIDUAL = {"StandardResidual": STANDARD, "AttentionResidual": ATTENTION, "BlockAttentionResidual": BLOCK}
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """Sizes are None where a core or an encoder has none of that name."""
+
+    task: str
+    views: tuple[str, ...]
+    image_size: tuple[int, int]
+    observed_steps: int
+    state_dim: int
+    vision: str
+    vision_residual: str  # STANDARD or ATTENTION
+    view_tokens: int | None  # of each view
+    core: str
+    depth: int
+    width: int
+    heads: int
+    patch: int
+    residual: str  # one of RESIDUAL's values
+    block_size: int
+    readout: str  # sum | attn
+    generator_class: str
+    generator: str
+    parametrisation: str | None
+    times: str | None
+    boundary_share: float | None
+    prediction: str | None  # of diffusion
+    num_levels: int | None
+    nfe: tuple[int, ...]
+    pred: int
+    exec: int
+
+    @property
+    def num_action_tokens(self) -> int:
+        return -(-self.pred // self.patch)
+
+    @property
+    def num_sublayers(self) -> int:
+        return 2 * self.depth
+
+    @property
+    def is_improved_mean_flow(self) -> bool:
+        return self.generator_class == "ImprovedMeanFlow"
+
+
+def describe(config: Mapping[str, Any]) -> Method:
+    """The method of a config that `conf/train.yaml` composed."""
+    encoder, core, generator = config["encoder"], config["core"], config["generator"]
+    residual = core.get("residual", {})
+    times = generator.get("times")
+    return Method(
+        task=config["task"]["name"],
+        views=tuple(config["observation"]["views"]),
+        image_size=tuple(config["observation"]["image_size"]),
+        observed_steps=config["horizon"]["obs"],
+        state_dim=config["state_dim"],
+        vision=_name(encoder.get("vision", encoder), VISION),
+        vision_residual=encoder.get("vision", {}).get("residual", STANDARD),
+        view_tokens=encoder.get("view_tokens", {}).get("tokens"),
+        core=_name(core, CORE),
+        depth=core["depth"],
+        width=core["width"],
+        heads=core["heads"],
+        patch=core.get("patch", 1),
+        residual=_name(residual, RESIDUAL) if residual else STANDARD,
+        block_size=residual.get("block_size", 1),
+        readout=residual.get("readout", "sum"),
+        generator_class=_class(generator),
+        generator=_name(generator, GENERATOR),
+        parametrisation=generator.get("parametrisation"),
+        times=_name(times, TIMES) if times else None,
+        boundary_share=generator.get("boundary_share"),
+        prediction=generator.get("prediction"),
+        num_levels=generator.get("num_levels"),
+        nfe=tuple(config["evaluation"]["nfe"]),
+        pred=config["horizon"]["pred"],
+        exec=config["horizon"]["exec"],
+    )
+
+
+def _class(part: Mapping[str, Any]) -> str:
+    return part["_target_"].rpartition(".")[2]
+
+
+def _name(part: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    return names.get(_class(part), _class(part))

@@ -1,0 +1,165 @@
+"""The numbers of a row of the tables, with their intervals, from the episodes of its evaluations."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from imfvla.reporting.answers import Answer, Evaluated
+from imfvla.reporting.mapping import TableRow
+from imfvla.reporting.metrics import TIMING, Row, summarise, wilson_interval
+from imfvla.reporting.paper import PaperRow
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A number and its 95% interval; None where there is no such number, or no interval for it."""
+
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+
+    def scaled(self, factor: float) -> "Measured":
+        numbers = (self.value, self.low, self.high)
+        return Measured(*(None if number is None else factor * number for number in numbers))
+
+
+class Result:
+    """What is known of a policy with a number of evaluations: a row of the tables, or one that stands in none.
+
+    Of several training seeds, the episodes of all count. Numbers are None where the row is missing.
+    """
+
+    def __init__(self, evaluated: Sequence[Evaluated], answer: Answer | None = None) -> None:
+        assert evaluated or answer
+        self.evaluated, self.answer = tuple(evaluated), answer
+
+    @classmethod
+    def of(cls, answer: Answer) -> "Result":
+        return cls(answer.evaluated, answer)
+
+    @property
+    def row(self) -> TableRow | None:
+        """The row of the tables that it stands in."""
+        return self.answer.row if self.answer else None
+
+    @property
+    def paper(self) -> PaperRow | None:
+        return self.row.paper if self.row else None
+
+    @property
+    def is_missing(self) -> bool:
+        return not self.evaluated
+
+    @property
+    def name(self) -> str:
+        """Short, and unique in a report."""
+        if self.row:
+            return self.row.name
+        evaluation = self.evaluated[0].evaluation
+        return f"{self.policy}, infer{self.nfe}, step {evaluation.summary['checkpoint_step']}"
+
+    @property
+    def policy(self) -> str:
+        """Experiment and overrides, the training seed apart."""
+        if self.row:
+            return f"{self.row.experiment}/{self.row.run}" if self.row.run else self.row.experiment
+        return self.evaluated[0].evaluation.label
+
+    @property
+    def nfe(self) -> int:
+        return self.row.nfe if self.row else self.evaluated[0].evaluation.nfe
+
+    @property
+    def task(self) -> str | None:
+        return self.evaluated[0].evaluation.summary["protocol"]["task"] if self.evaluated else None
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the weights are those of the end of the training."""
+        evaluations = [found.evaluation for found in self.evaluated]
+        return all(e.summary["checkpoint_step"] == e.training_steps for e in evaluations) and bool(
+            evaluations
+        )
+
+    @property
+    def episodes(self) -> list[Row]:
+        """Of all training seeds, one after the other."""
+        return [row for found in self.evaluated for row in found.episodes]
+
+    @cached_property
+    def metrics(self) -> dict[str, Measured]:
+        """By name: those of `metrics.summarise`, `iqm_return` and shares, with intervals where there are any."""
+        if self.is_missing:
+            names = (*SUMMARISED, *BOOTSTRAPPED, "nonzero_share", "success_share", "inference_fps")
+            return dict.fromkeys(names, Measured(None))
+        summary = summarise(self.episodes)
+        metrics = {name: Measured(summary[name]) for name in SUMMARISED}
+        for name, (column, statistic) in BOOTSTRAPPED.items():
+            metrics[name] = _bootstrapped([column(found.episodes) for found in self.evaluated], statistic)
+        for name in ("nonzero", "success"):
+            metrics[f"{name}_share"] = _share(summary[f"{name}_episodes"], summary["episodes"])
+        latency = metrics["inference_ms_mean"]
+        rates = (None if ms is None else 1000 / ms for ms in (latency.value, latency.high, latency.low))
+        metrics["inference_fps"] = Measured(*rates)
+        return metrics
+
+    @cached_property
+    def paper_success_share(self) -> Measured:
+        """The share printed in the paper, with the interval that its count deserves."""
+        return _share(self.paper.success, self.paper.episodes) if self.paper else Measured(None)
+
+
+def returns(episodes: Sequence[Row]) -> np.ndarray:
+    return np.array([row["total_reward"] for row in episodes], float)
+
+
+def highest_rewards(episodes: Sequence[Row]) -> np.ndarray:
+    return np.array([row["max_reward"] for row in episodes], float)
+
+
+def latencies(episodes: Sequence[Row]) -> np.ndarray:
+    """Mean time of a chunk in each episode [ms]; episodes without any are left out."""
+    return np.array(
+        [np.mean(row[TIMING]["inference_ms"]) for row in episodes if row[TIMING]["inference_ms"]], float
+    )
+
+
+def successes(episodes: Sequence[Row]) -> np.ndarray:
+    return np.array([row["success"] for row in episodes], bool)
+
+
+def _share(count: int, number: int) -> Measured:
+    return Measured(count / number, *wilson_interval(count, number))
+
+
+def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    return stats.trim_mean(values, 0.25, axis=axis)
+
+
+def _bootstrapped(groups: Sequence[np.ndarray], statistic: Callable[..., np.ndarray]) -> Measured:
+    """PROVISIONAL until the statistics are there."""
+    values = np.concatenate(groups)
+    if not values.size:
+        return Measured(None)
+    value = float(statistic(values))
+    if np.ptp(values) == 0:
+        return Measured(value, value, value)
+    found = stats.bootstrap(
+        (values,), statistic, n_resamples=10_000, rng=np.random.default_rng(0)
+    ).confidence_interval
+    return Measured(value, float(found.low), float(found.high))
+
+
+SUMMARISED = (
+    "max_return", "nonzero_episodes", "success_episodes", "control_fps", "inference_ms_median", "inference_ms_p95",
+)  # fmt: skip
+BOOTSTRAPPED = {
+    "avg_return": (returns, np.mean),
+    "median_return": (returns, np.median),
+    "iqm_return": (returns, interquartile_mean),
+    "mean_max_reward": (highest_rewards, np.mean),
+    "inference_ms_mean": (latencies, np.mean),
+}

@@ -1,0 +1,127 @@
+"""Figures of results: what they show of synthetic runs, that nothing is cut off, and what is drawn of no run at all."""
+
+import json
+
+import numpy as np
+import pytest
+from seen import clipped, texts
+from synthetic_runs import answer_row, episodes_of
+
+from imfvla.errors import UserError
+from imfvla.figures.ablations import transfer_ablations
+from imfvla.figures.depth_attention import FILE, depth_attention, read_depth_attention
+from imfvla.figures.evaluations import success_by_evaluations
+from imfvla.figures.failures import failed_stages, first_failed_stage
+from imfvla.figures.learning import learning_curves
+from imfvla.figures.reward_latency import errors, pareto_frontier, reward_latency
+from imfvla.reporting.answers import Sources
+from imfvla.reporting.curves import learning_curve
+from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.results import Measured, Result
+
+MAPPING = read_mapping()
+MISSING = ("socket_smolvla", "transfer_dit_ph08_exec08", "socket_l1")
+FIGURES = [reward_latency, transfer_ablations, success_by_evaluations, learning_curves, failed_stages]
+
+
+def results_of(*directories) -> list[Result]:
+    sources = Sources(directories)
+    return [Result.of(sources.answer(row, MAPPING)) for row in MAPPING.rows]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> list[Result]:
+    """Of all rows but three."""
+    root = tmp_path_factory.mktemp("runs")
+    for index, row in enumerate(MAPPING.rows):
+        if row.name not in MISSING:
+            quality = 0.25 + 0.6 * np.random.default_rng(index).random()
+            answer_row(root, row, quality=quality, latency_ms=2.0 + 4.5 * row.nfe)
+    return results_of(root)
+
+
+def of_table(results, table: int) -> list[Result]:
+    return [result for result in results if result.row.table == table]
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_no_text_is_cut_off_whether_there_are_results_or_none(draw, results, tmp_path):
+    for found in (results, results_of(tmp_path)):
+        table = {reward_latency: 1, transfer_ablations: 2}.get(draw)
+        assert not clipped(draw(of_table(found, table) if table else found))
+
+
+def test_a_missing_row_is_marked_and_has_no_bar(results):
+    figure = transfer_ablations(of_table(results, 2))
+    assert texts(figure).count("missing") == 2  # in both panels
+    lengths = [[bar.get_width() for bar in axes.containers[-1]] for axes in figure.axes]
+    assert all(np.isnan(panel[8]) and np.isfinite(np.delete(panel, 8)).all() for panel in lengths)
+
+
+def test_the_frontier_is_what_nothing_beats_in_both():
+    points = [(2.6, 466), (14.4, 1473), (15.1, 1514), (16.2, 1275), (100, 290), (14.4, 1000)]
+    assert pareto_frontier(points) == [(2.6, 466), (14.4, 1473), (15.1, 1514)]
+
+
+def test_printed_values_and_ours_are_in_panels_of_their_own(results):
+    paper, ours = reward_latency(of_table(results, 1)).axes
+    assert len(paper.texts) == 7
+    assert len(ours.texts) == 12
+    assert "infer3" in [text.get_text() for text in paper.texts]
+
+
+def test_error_bars_reach_from_the_value_to_its_interval():
+    found = errors([Measured(5.0, 4.0, 7.0), Measured(1.0)])
+    np.testing.assert_array_equal(found, [[1, np.nan], [2, np.nan]])
+
+
+def test_the_first_failed_stage_by_hand():
+    row = episodes_of(0.5, 100_000, 1, task="socket", latency_ms=1.0)[0]
+    assert first_failed_stage(row | {"first_step_of_stage": [3, 9, -1, -1]}) == 2
+    assert first_failed_stage(row | {"first_step_of_stage": [3, 9, 11, 12]}) is None
+    assert first_failed_stage(row | {"first_step_of_stage": [-1, -1]}) == 0
+
+
+def test_bars_of_failures_fill_a_hundred_percent(results):
+    for axes in failed_stages(results).axes:
+        ends = [bar.get_x() + bar.get_width() for bar in axes.containers[-1]]
+        np.testing.assert_allclose(ends, 100)
+
+
+def test_weights_at_the_end_of_training_are_compared_over_evaluations(results):
+    socket, _ = success_by_evaluations(results).axes
+    lines = {bars.get_label(): len(bars.lines[0].get_xdata()) for bars in socket.containers}
+    assert lines["socket_ph32_exec16"] == 2  # one evaluation is answered by a third of the training
+    assert lines["socket_ddpm_ph32_exec16"] == 4
+    assert lines["socket_ph32_exec16/generator=flow_high_noise"] == 3
+
+
+def test_a_learning_curve_without_its_cut_off_last_line(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 10, "loss": 2.0}\n{"step": 20, "loss": 1.0}\n{"step": 3')
+    steps, loss = learning_curve(tmp_path)
+    assert (steps.tolist(), loss.tolist()) == ([10, 20], [2, 1])
+    path.write_text('{"step": 10, "loss": 2.0}\n{"st\n{"step": 20, "loss": 1.0}\n')
+    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is no row of metrics"):
+        learning_curve(tmp_path)
+
+
+def test_depth_weights_as_recorded(tmp_path):
+    found = {"experiment": "e", "checkpoint_step": 5, "actions": [[1.0], [0.25, 0.75], [0.5, 0.25, 0.25]]}
+    assert read_depth_attention(tmp_path) is None
+    (tmp_path / FILE).write_text(json.dumps(found))
+    figure = depth_attention([read_depth_attention(tmp_path)])
+    assert not clipped(figure)
+    assert {"e, step 5", "1.00", ".25", ".75", "emb.", "1 attn", "1 MLP"} <= set(texts(figure))
+    image = figure.axes[0].images[0].get_array()
+    np.testing.assert_array_equal(image.filled(-1), [[1, -1, -1], [0.25, 0.75, -1], [0.5, 0.25, 0.25]])
+
+
+def test_no_depth_weights_and_broken_ones(tmp_path):
+    figure = depth_attention([])
+    assert not clipped(figure)
+    assert "tools/depth_attention.py" in texts(figure)[0]
+    for text in ("{", "[]", '{"actions": [[1.0]]}', '{"actions": []}'):
+        (tmp_path / FILE).write_text(text)
+        with pytest.raises(UserError, match="holds no depth weights"):
+            read_depth_attention(tmp_path)
