@@ -42,7 +42,7 @@ eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or trans
 bench: setup  ## Measure simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)
 
-tables: setup  ## Make the paper's tables from the run directories
+tables: setup  ## Make the paper's tables, figures and a page from the run directories
 	$(PY) -m imfvla.report $(ARGS)
 
 gallery: setup  ## Write pictures of every view of both tasks

@@ -3,7 +3,7 @@
 import errno
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,26 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Atomic. Raises UserError on a write error."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """All files or none: each is written beside its place first, and takes it once all of them are written.
+
+    Raises UserError on a write error; then the old files are still there.
+    """
+    temporaries = {path: path.with_name(path.name + PARTIAL) for path in contents}
+    try:
+        for path, content in contents.items():
+            with clear_write_errors(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                temporaries[path].write_bytes(content)
+        for path, temporary in temporaries.items():
+            with clear_write_errors(path):
+                os.replace(temporary, path)
+    finally:
+        for temporary in temporaries.values():
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -3,30 +3,31 @@
 from pathlib import Path
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
+
+from imfvla.composition import compose
 from imfvla.entry import entry_point
-from imfvla.errors import UserError
-from imfvla.reporting.runs import find_runs
-from imfvla.reporting.table_row import print_row
-from imfvla.reporting.tables import collect, tables, write
 from imfvla.run_directory import RunDirectory
 
 
 @entry_point("report")
 def main(config: dict[str, Any]) -> None:
-    """Prints the rows of one run, or the tables of all runs, which it also writes as Markdown and CSV."""
+    """Prints the rows of one run, or publishes the tables of all runs: Markdown, CSV, LaTeX, figures and a page."""
     if config["run"]:
+        from imfvla.reporting.table_row import print_row
+
         print_row(RunDirectory(config["run"]))
         return
+    from imfvla.publication import publish  # after the config is checked: a slip is told at once
+    from imfvla.reporting.mapping import PATH, read_mapping
+
+    mapping = read_mapping(Path(config["mapping"]) if config["mapping"] else PATH)
     directories = [Path(directory) for directory in config["directories"]]
-    runs = find_runs(directories)
-    if not runs:
-        raise UserError(
-            f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "
-            "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
-        )
-    named = tables(collect(runs))
-    paths = write(named, Path(config["output"]))
-    for table in named.values():
+    GlobalHydra.instance().clear()  # the method is composed below
+    method = compose("train", config["method"])
+    publication = publish(directories, Path(config["output"]), mapping, method)
+    paths = publication.write()
+    for table in publication.tables:
         table.print()
     for path in paths:
         print(path)

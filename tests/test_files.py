@@ -3,7 +3,7 @@ import errno
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.files import write_atomically, write_json, write_text
+from imfvla.files import write_atomically, write_json, write_text, write_together
 
 
 def test_replaces_whole(tmp_path):
@@ -39,3 +39,15 @@ def test_interrupted_write_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "file", interrupt)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_written_together_appear_together(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "new" / "two"
+    write_together({one: b"1", two: b"2"})
+    assert (one.read_bytes(), two.read_bytes()) == (b"1", b"2")
+    in_the_way = tmp_path / "file" / "three"
+    in_the_way.parent.write_text("no directory")
+    with pytest.raises(UserError, match=f"Cannot write {in_the_way}"):
+        write_together({one: b"changed", in_the_way: b"3"})
+    assert one.read_bytes() == b"1"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "new", "one"]

@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import BLUE, GREY, INK, new_figure, style
-from imfvla.reporting.results import Measured, Result
+from imfvla.reporting.measured import Measured
+from imfvla.reporting.results import Result
 
 BAR = 0.38  # of the distance between two groups
 

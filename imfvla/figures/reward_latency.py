@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from imfvla.figures.panels import plain_log_ticks
 from imfvla.figures.style import BLACK, CYCLE, GREY, MARKERS, new_figure, style
+from imfvla.reporting.measured import Measured
 from imfvla.reporting.paper import PaperRow
-from imfvla.reporting.results import Measured, Result
+from imfvla.reporting.results import Result
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
 """The numbers of a row of the tables, with their intervals, from the episodes of its evaluations."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -9,21 +8,9 @@ from scipy import stats
 
 from imfvla.reporting.answers import Answer, Evaluated
 from imfvla.reporting.mapping import TableRow
+from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import TIMING, Row, summarise, wilson_interval
 from imfvla.reporting.paper import PaperRow
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A number and its 95% interval; None where there is no such number, or no interval for it."""
-
-    value: float | None
-    low: float | None = None
-    high: float | None = None
-
-    def scaled(self, factor: float) -> "Measured":
-        numbers = (self.value, self.low, self.high)
-        return Measured(*(None if number is None else factor * number for number in numbers))
 
 
 class Result:

@@ -11,9 +11,12 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from imfvla.reporting.measured import Measured
+
 WIDE = 160  # characters a line where no terminal says how many it has
 NOTHING = "-"
 MISSING = "missing"
+FILL = "What is missing is filled by:"
 VALUE = r"[-+<]?[\d.]+(?:/\d+)?[%×]?"  # a number, a count of so many, a share, a ratio, a bound
 NUMERIC = rf"{NOTHING}|{MISSING}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?"  # alone or with its interval
 LATEX = {
@@ -24,15 +27,21 @@ LATEX = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Title, column names, rows of as many cells, and paragraphs below."""
+    """Title, column names, rows of as many cells, and paragraphs below.
+
+    `keys` has for each row the names of what it is of, where any are given; `commands` fill what is missing, by name.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
+    keys: tuple[tuple[str, ...], ...] = ()
+    commands: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         assert all(len(row) == len(self.columns) for row in self.rows), self.title
+        assert len(self.keys) in (0, len(self.rows)), self.title
 
     def markdown(self) -> str:
         """A Markdown table under a heading."""
@@ -40,7 +49,12 @@ class Table:
         body = "\n".join(
             "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
         )
-        return "\n".join((f"## {self.title}", "", body, "", *(f"{note}\n" for note in self.notes)))
+        notes = "".join(f"\n{note}\n" for note in self.notes)
+        commands = "".join(
+            f"- {', '.join(names)}: `{command}`\n" for command, names in self.by_command().items()
+        )
+        missing = f"\n{FILL}\n\n{commands}" if commands else ""
+        return f"## {self.title}\n\n{body}\n{notes}{missing}"
 
     def csv(self) -> str:
         """Comma-separated values, names first."""
@@ -62,6 +76,13 @@ class Table:
             )
         )  # fmt: skip
 
+    def by_command(self) -> dict[str, list[str]]:
+        """What each command fills."""
+        grouped: dict[str, list[str]] = {}
+        for name, command in self.commands:
+            grouped.setdefault(command, []).append(name)
+        return grouped
+
     def is_numeric(self, name: str) -> bool:
         """Whether all cells of a column are numbers, with or without interval, or say that there is none."""
         index = self.columns.index(name)
@@ -71,7 +92,8 @@ class Table:
         """To the terminal, or to `console`."""
         if console is None:
             console = Console(width=None if sys.stdout.isatty() else WIDE)
-        title, note = Text(self.title, "bold"), Text("\n".join(self.notes)) if self.notes else None
+        commands = [FILL, *self.by_command()] if self.commands else []
+        title, note = Text(self.title, "bold"), Text("\n".join((*self.notes, *commands))) or None
         table = RichTable(
             title=title, caption=note, box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left"
         )
@@ -85,6 +107,21 @@ class Table:
 def number(value: float | None, digits: int) -> str:
     """With so many digits after the point, a dash for None."""
     return NOTHING if value is None else f"{value:.{digits}f}"
+
+
+def with_interval(measured: Measured, digits: int, unit: str = "") -> str:
+    """A number and its interval, as in "1.25 [1.00, 1.50]"; a dash where there is no number."""
+    if measured.value is None:
+        return NOTHING
+    text = f"{measured.value:.{digits}f}{unit}"
+    return text if measured.low is None else f"{text} {interval(measured, digits, unit)}"
+
+
+def interval(measured: Measured, digits: int, unit: str = "") -> str:
+    """As in "[75.6%, 89.9%]", empty where there is none."""
+    if measured.low is None or measured.high is None:
+        return ""
+    return f"[{measured.low:.{digits}f}{unit}, {measured.high:.{digits}f}{unit}]"
 
 
 def latex_text(text: str) -> str:

@@ -1,110 +1,267 @@
-"""Tables 1 to 3 over many runs, ours beside the paper's: Markdown and CSV."""
+"""Tables 1 to 3, ours beside the paper's printed values, and the rows of ours that the paper does not have."""
 
-import logging
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
 
-from imfvla.files import write_text
-from imfvla.reporting.mapping import Comparison, TableRow, read_mapping
+from imfvla.reporting.comparisons import Compared
+from imfvla.reporting.mapping import LAST, Comparison
+from imfvla.reporting.measured import Measured
 from imfvla.reporting.paper import TITLES, PaperRow
-from imfvla.reporting.runs import Evaluation, evaluations, rows
-from imfvla.reporting.table import NOTHING, Table
-from imfvla.reporting.table_row import COLUMNS, ours, printed
-from imfvla.run_directory import RunDirectory
+from imfvla.reporting.results import Result
+from imfvla.reporting.table import MISSING, NOTHING, Table, interval, number, with_interval
+from imfvla.reporting.table_row import machine
 
-Ours = dict[tuple[str, int], Evaluation]  # label and nfe -> the evaluation that stands for it
+COLUMNS = (
+    "Row", "nfe", "Source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "Latency ms", "p95 ms",
+    "Inf. FPS", "Control FPS",
+)  # fmt: skip
 PRINTED = {  # compared metric -> field of a printed row
     "avg_return": "avg_reward",
     "success_episodes": "success",
     "inference_ms_mean": "latency_ms",
     "inference_fps": "inference_fps",
 }
-log = logging.getLogger(__name__)
+DATA = {  # column of the CSV -> metric and digits; with an interval also its ends
+    "avg_reward": ("avg_return", 4),
+    "median": ("median_return", 4),
+    "iqm": ("iqm_return", 4),
+    "avg_max": ("mean_max_reward", 4),
+    "max": ("max_return", 4),
+    "nonzero": ("nonzero_episodes", 0),
+    "nonzero_share": ("nonzero_share", 6),
+    "success": ("success_episodes", 0),
+    "success_share": ("success_share", 6),
+    "latency_ms": ("inference_ms_mean", 4),
+    "latency_ms_median": ("inference_ms_median", 4),
+    "latency_ms_p95": ("inference_ms_p95", 4),
+    "inference_fps": ("inference_fps", 4),
+    "control_fps": ("control_fps", 4),
+}
+WITHOUT_INTERVAL = ("max", "nonzero", "success", "latency_ms_median", "latency_ms_p95", "control_fps")
+PRINTED_FIELDS = (
+    "avg_reward",
+    "median",
+    "avg_max",
+    "nonzero",
+    "success",
+    "episodes",
+    "latency_ms",
+    "inference_fps",
+)
+INTERVALS = (
+    "In brackets: 95% intervals; of counts Wilson's, of means and medians BCa bootstrap over episodes, with several "
+    "training seeds over these too. Latency: mean over all replannings, numpy to numpy."
+)
 
 
-def collect(runs: Sequence[RunDirectory]) -> Ours:
-    """The evaluation of each experiment and nfe in the reporting band; of several runs, that of the last one."""
-    found: Ours = {}
-    for run in runs:
-        for evaluation in rows(run) if evaluations(run) else []:
-            if not evaluation.is_reporting:
-                log.info("%s is left out: no whole episodes of the reporting band.", evaluation.folder)
-                continue
-            found[label(evaluation), evaluation.nfe] = evaluation
-    return found
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A table as people read it, and the numbers in it as programs read them."""
+
+    shown: Table
+    data: Table
 
 
-def label(evaluation: Evaluation) -> str:
-    """The experiment, with the overrides in the run's name if any: such runs stand for no row of the paper."""
-    experiment, name = evaluation.summary["experiment"], evaluation.run.resolve().name
-    return experiment if name in ("default", experiment) else f"{experiment}/{name}"
+def paper_table(number: int, results: Sequence[Result], notes: Sequence[str] = ()) -> Document:
+    """Table 1 or 2: under each printed row ours, then the rivals that the paper does not have."""
+    cells, keys = [], []
+    for result in results:
+        if result.paper:
+            cells.append((result.row.label, str(result.nfe), "paper", *printed(result.paper)))
+            keys.append(())
+        cells.append((result.row.label, str(result.nfe), "ours", *ours(result)))
+        keys.append((result.name,))
+    missing = tuple((result.row.label, result.answer.command) for result in results if result.is_missing)
+    every = (*(text for text in (_described(results),) if text), INTERVALS, *notes)
+    return Document(
+        Table(TITLES[number], COLUMNS, tuple(cells), every, tuple(keys), missing),
+        Table(TITLES[number], *_data(results)),
+    )
 
 
-def tables(found: Ours) -> dict[str, Table]:
-    """File stem -> table: the paper's three, and the rows of ours that the paper does not have."""
-    named = {f"table{number}": _paper_table(number, found) for number in (1, 2)}
-    named["table3"] = _comparison_table(found)
-    known = {_key(row) for row in read_mapping().rows}
-    others = {key: evaluation for key, evaluation in found.items() if key not in known}
-    if others:
-        cells = tuple(
-            (experiment, str(nfe), "ours", *ours(evaluation.summary))
-            for (experiment, nfe), evaluation in sorted(others.items())
+def other_table(results: Sequence[Result]) -> Document:
+    """Evaluations of the reporting band that stand in no row of the tables."""
+    title = "Evaluations that stand in no row"
+    cells = tuple((result.policy, str(result.nfe), _weights(result), *ours(result)) for result in results)
+    keys = tuple((result.name,) for result in results)
+    notes = (INTERVALS,) if results else ("There are none.",)
+    columns = ("Policy", "nfe", "Weights", *COLUMNS[3:])
+    return Document(Table(title, columns, cells, notes, keys), Table(title, *_data(results)))
+
+
+def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) -> Document:
+    """Table 3: every ratio of the paper from our rows."""
+    cells = []
+    for found in compared:
+        paper = found.comparison.paper
+        ours = MISSING if found.is_missing else "refused" if found.refused else shown(found)
+        cells.append(
+            (paper.comparison, paper.metric, paper.result, ours, p_value(found.p), p_value(found.p_holm))
         )
-        named["others"] = Table("Rows without a counterpart in the paper", ("Experiment", *COLUMNS), cells)
-    return named
+    commands = {
+        result.row.label: result.answer.command
+        for found in compared
+        for result in (found.row, found.baseline)
+        if result.is_missing
+    }
+    refused = tuple(
+        f"{found.comparison.paper.label}: refused, as {found.refused}." for found in compared if found.refused
+    )
+    columns = ("Comparison", "Metric", "Paper", "Ours", "p", "p (Holm)")
+    keys = tuple((found.row.name, found.baseline.name) for found in compared)
+    table = Table(TITLES[3], columns, tuple(cells), (*notes, *refused), keys, tuple(commands.items()))
+    return Document(table, Table(TITLES[3], *_comparison_data(compared)))
 
 
-def write(named: dict[str, Table], directory: Path) -> list[Path]:
-    """Writes each table as Markdown and CSV; returns the paths."""
-    paths = []
-    for stem, table in named.items():
-        for suffix, text in ((".md", table.markdown()), (".csv", table.csv())):
-            write_text(directory / f"{stem}{suffix}", text)
-            paths.append(directory / f"{stem}{suffix}")
-    return paths
+def printed(paper: PaperRow) -> tuple[str, ...]:
+    """The cells of a printed row, in the order of COLUMNS[3:]."""
+    return (
+        number(paper.avg_reward, 2),
+        number(paper.median, 1),
+        number(paper.avg_max, 2),
+        f"{paper.nonzero}/{paper.episodes}",
+        f"{paper.success}/{paper.episodes}",
+        number(paper.latency_ms, 3),
+        NOTHING,
+        number(paper.inference_fps, 3),
+        NOTHING,
+    )
+
+
+def ours(result: Result) -> tuple[str, ...]:
+    """The cells of a row of ours, in the order of COLUMNS[3:]."""
+    if result.is_missing:
+        return (MISSING,) * len(COLUMNS[3:])
+    metrics = result.metrics
+    return (
+        with_interval(metrics["avg_return"], 2),
+        with_interval(metrics["median_return"], 1),
+        with_interval(metrics["mean_max_reward"], 2),
+        _count(result, "nonzero"),
+        _count(result, "success"),
+        with_interval(metrics["inference_ms_mean"], 3),
+        number(metrics["inference_ms_p95"].value, 3),
+        with_interval(metrics["inference_fps"], 2),
+        number(metrics["control_fps"].value, 0),
+    )
 
 
 def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
     """A result of Table 3 from two printed rows, as the paper prints it: "1.76×" or "+15"."""
     column = PRINTED[comparison.of]
-    return _result(comparison.operation, getattr(row, column), getattr(baseline, column))
-
-
-def _key(row: TableRow) -> tuple[str, int]:
-    return (f"{row.experiment}/{row.run}" if row.run else row.experiment), row.nfe
-
-
-def _paper_table(number: int, found: Ours) -> Table:
-    cells = []
-    for row in read_mapping().of_table(number):
-        if row.paper:
-            cells.append((row.label, str(row.nfe), "paper", *printed(row.paper)))
-        if _key(row) in found:
-            cells.append((row.experiment, str(row.nfe), "ours", *ours(found[_key(row)].summary)))
-    note = "Our rows stand below the paper's of the same experiment; where none stands, it has not been run here."
-    return Table(TITLES[number], ("Experiment", *COLUMNS), tuple(cells), (note,))
-
-
-def _comparison_table(found: Ours) -> Table:
-    cells = []
-    for comparison in read_mapping().comparisons:
-        row, baseline = found.get(_key(comparison.row)), found.get(_key(comparison.baseline))
-        result = NOTHING
-        if row and baseline and row.summary["episodes"] == baseline.summary["episodes"]:
-            result = _result(
-                comparison.operation, row.summary[comparison.of], baseline.summary[comparison.of]
-            )
-        paper = comparison.paper
-        cells.append((paper.comparison, paper.metric, paper.result, result))
-    return Table(TITLES[3], ("Comparison", "Metric", "Paper", "Ours"), tuple(cells))
-
-
-def _result(operation: str, value: float | None, against: float | None) -> str:
+    value, against = getattr(row, column), getattr(baseline, column)
     if value is None or against is None:
         return NOTHING
-    if operation == "difference":
+    if comparison.operation == "difference":
         return f"{value - against:+g}"
-    if operation == "inverse_ratio":
-        value, against = against, value
-    return f"{value / against:.2f}×" if against else NOTHING
+    ratio = value / against if comparison.operation == "ratio" else against / value
+    return f"{ratio:.2f}×"
+
+
+def shown(found: Compared) -> str:
+    """A result of ours with its interval, in the form of the paper's."""
+    if found.comparison.operation != "difference":
+        return with_interval(found.result, 2, "×")
+    value = found.result
+    bounds = "" if value.low is None else f" [{value.low:+.1f}, {value.high:+.1f}]"
+    return f"{value.value:+g}{bounds}"
+
+
+def p_value(p: float | None) -> str:
+    """Three digits, or that it is smaller."""
+    if p is None:
+        return NOTHING
+    return "<0.001" if p < 0.0005 else f"{p:.3f}"
+
+
+def _count(result: Result, name: str) -> str:
+    metrics = result.metrics
+    count = f"{metrics[f'{name}_episodes'].value}/{len(result.episodes)}"
+    return f"{count} {interval(metrics[f'{name}_share'].scaled(100), 1, '%')}"
+
+
+def _weights(result: Result) -> str:
+    evaluations = [found.evaluation for found in result.evaluated]
+    steps = evaluations[0].summary["checkpoint_step"]
+    seeds = ", ".join(str(evaluation.training_seed) for evaluation in evaluations)
+    return f"step {steps} of {evaluations[0].training_steps}, seed {seeds}"
+
+
+def _described(results: Sequence[Result]) -> str:
+    """The protocol that all rows of a table share, and the machines that their latencies are of."""
+    found = [evaluated.evaluation for result in results for evaluated in result.evaluated]
+    if not found:
+        return ""
+    protocol, seeds = found[0].summary["protocol"], found[0].seeds
+    machines = list(dict.fromkeys(machine(evaluation.summary) for evaluation in found))
+    task = f"{protocol['task']} ({protocol['variant']})"
+    text = f"Ours: {len(seeds)} episodes from seeds {seeds[0]} to {seeds[-1]}, {task}"
+    if len(machines) == 1:
+        return f"{text}; {machines[0]}."
+    return f"{text}. Latencies are of {len(machines)} machines and not comparable: {'; '.join(machines)}."
+
+
+def _data(results: Sequence[Result]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """Columns and rows of the CSV."""
+    columns = [
+        "row",
+        "method",
+        "setting",
+        "experiment",
+        "run",
+        "nfe",
+        "checkpoint",
+        "training_seeds",
+        "episodes",
+    ]
+    for name in DATA:
+        columns += [name] if name in WITHOUT_INTERVAL else [name, f"{name}_low", f"{name}_high"]
+    columns += [*(f"paper_{name}" for name in PRINTED_FIELDS), "status", "command"]
+    return tuple(columns), tuple(_data_row(result) for result in results)
+
+
+def _data_row(result: Result) -> tuple[str, ...]:
+    row, evaluations = result.row, [found.evaluation for found in result.evaluated]
+    first = evaluations[0] if evaluations else None
+    cells = [
+        result.name,
+        row.method if row else "",
+        row.setting if row else "",
+        row.experiment if row else first.experiment,
+        row.run if row else first.key,
+        str(result.nfe),
+        str(first.summary["checkpoint_step"]) if first else row.checkpoint if row.checkpoint != LAST else "",
+        " ".join(str(evaluation.training_seed) for evaluation in evaluations),
+        str(len(result.episodes)) if first else "",
+    ]
+    for name, (metric, digits) in DATA.items():
+        measured = result.metrics[metric]
+        numbers = (
+            [measured.value] if name in WITHOUT_INTERVAL else [measured.value, measured.low, measured.high]
+        )
+        cells += ["" if value is None else f"{value:.{digits}f}" for value in numbers]
+    for name in PRINTED_FIELDS:
+        value = getattr(result.paper, name) if result.paper else None
+        cells.append("" if value is None else str(value))
+    command = result.answer.command if result.answer else ""
+    return (*cells, MISSING if result.is_missing else "measured", command)
+
+
+def _comparison_data(compared: Sequence[Compared]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    columns = (
+        "comparison", "metric", "row", "baseline", "of", "operation", "paper", "ours", "ours_low", "ours_high", "p",
+        "p_holm", "status", "reason",
+    )  # fmt: skip
+    cells = []
+    for found in compared:
+        comparison, paper = found.comparison, found.comparison.paper
+        result = found.result or Measured(None)
+        numbers = (result.value, result.low, result.high, found.p, found.p_holm)
+        cells.append(
+            (
+                paper.comparison, paper.metric, found.row.name, found.baseline.name, comparison.of,
+                comparison.operation, paper.result, *("" if value is None else f"{value:.6g}" for value in numbers),
+                MISSING if found.is_missing else "refused" if found.refused else "measured", found.refused or "",
+            )
+        )  # fmt: skip
+    return columns, tuple(cells)

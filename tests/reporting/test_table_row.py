@@ -11,10 +11,8 @@ from rich.console import Console
 
 from imfvla.errors import UserError
 from imfvla.reporting.metrics import summarise
-from imfvla.reporting.runs import find_runs, rows
-from imfvla.reporting.table import Table
+from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import print_row
-from imfvla.reporting.tables import collect, tables, write
 from imfvla.run_directory import RunDirectory
 
 EXPECTED = Path(__file__).with_name("table_row.md").read_text()
@@ -92,41 +90,6 @@ def test_rows_of_the_selection_band_are_marked(tmp_path):
     assert "Not all rows are whole episodes of the reporting band." in (path / "table_row.md").read_text()
 
 
-def test_tables_of_all_runs(run, tmp_path):
-    baseline = make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
-    write_evaluation(baseline, 1, gain=0.5)
-    write_evaluation(run, 3)
-    named = tables(collect(find_runs([tmp_path / "runs", tmp_path / "nothing"])))
-    assert list(named) == ["table1", "table2", "table3", "others"]
-    assert len(named["table1"].rows) == 7 + 3
-    assert len(named["table2"].rows) == 11
-    assert ("Socket iMF infer3 vs ACT", "Avg. reward", "5.23×", "2.00×") in named["table3"].rows
-    assert [row[1] for row in named["others"].rows] == ["4"]
-    paths = write(named, tmp_path / "tables")
-    assert sorted(path.name for path in paths)[:2] == ["others.csv", "others.md"]
-    assert all(path.stat().st_size > 0 for path in paths)
-
-
-def test_runs_with_overrides_and_other_seeds_stand_for_no_row_of_the_paper(run, tmp_path):
-    varied = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "core=standard")
-    write_evaluation(varied, 1, gain=9)
-    selection = make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
-    write_evaluation(selection, 1, first_seed=10_000)
-    found = collect(find_runs([tmp_path]))
-    assert sorted(found) == [
-        ("socket_ph32_exec16", 1), ("socket_ph32_exec16", 4), ("socket_ph32_exec16/core=standard", 1),
-    ]  # fmt: skip
-    assert len(tables(found)["table1"].rows) == 7 + 1
-
-
-def test_of_two_runs_of_an_experiment_the_later_directory_stands(run, tmp_path):
-    shipped = make_run(tmp_path / "pretrained" / "socket_ph32_exec16")
-    write_evaluation(shipped, 1, gain=2)
-    for order, reward in (("runs", "pretrained"), 3000), (("pretrained", "runs"), 1500):
-        found = collect(find_runs(tmp_path / name for name in order))
-        assert found["socket_ph32_exec16", 1].summary["avg_return"] == reward
-
-
 def test_a_broken_or_incomplete_summary_is_named(run):
     path = next(run.glob("rollouts/*_nfe1_*/summary.json"))
     path.write_text("{")
@@ -142,12 +105,6 @@ def test_a_run_without_evaluation_is_named(tmp_path):
         UserError, match=r"has no finished evaluation: make one with python -m imfvla\.evaluate"
     ):
         rows(RunDirectory(make_run(tmp_path / "run")))
-
-
-def test_a_table_for_spreadsheets_and_markdown():
-    table = Table("Title", ("a", "b"), (("1, 2", "x|y"),), notes=("Note.",))
-    assert table.csv() == 'a,b\n"1, 2",x|y\n'
-    assert table.markdown() == "## Title\n\n| a | b |\n| --- | --- |\n| 1, 2 | x\\|y |\n\nNote.\n"
 
 
 def test_the_command_needs_neither_torch_nor_a_simulator(run):

@@ -1,0 +1,130 @@
+"""Everything that run directories have to say, as files: tables, figures and a page. Needs neither torch nor mujoco."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.figures.ablations import transfer_ablations
+from imfvla.figures.components import method_components
+from imfvla.figures.depth_attention import depth_attention, read_depth_attention
+from imfvla.figures.evaluations import success_by_evaluations
+from imfvla.figures.failures import failed_stages
+from imfvla.figures.learning import learning_curves
+from imfvla.figures.overview import method_overview
+from imfvla.figures.reward_latency import reward_latency
+from imfvla.figures.style import render
+from imfvla.files import write_together
+from imfvla.reporting.answers import Sources, check_equal_protocols
+from imfvla.reporting.comparisons import compare
+from imfvla.reporting.mapping import Mapping as RowMapping
+from imfvla.reporting.page import Picture, page
+from imfvla.reporting.paper import TABLES
+from imfvla.reporting.results import Result
+from imfvla.reporting.table import Table
+from imfvla.reporting.tables import Document, comparison_table, other_table, paper_table
+
+MAX_HEAT_MAPS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """Tables for the terminal, and the content of every file by its path."""
+
+    tables: tuple[Table, ...]
+    files: dict[Path, bytes]
+
+    def write(self) -> list[Path]:
+        """All files or none. Raises UserError on a write error."""
+        write_together(self.files)
+        return list(self.files)
+
+
+def publish(
+    directories: Sequence[Path], output: Path, mapping: RowMapping, method: Mapping[str, Any]
+) -> Publication:
+    """What stands in the run directories, as `output` is to hold it; writes nothing.
+
+    Args:
+      directories: hold run directories; for a row, a later one counts before an earlier one.
+      output: directory of the files, from where the page's links lead to the runs.
+      mapping: rows to runs.
+      method: a composed training config, for the figures of the method.
+
+    Raises:
+      UserError: runs are damaged, contradict each other or mix protocols; or no row of theirs is in any table.
+    """
+    sources = Sources(directories)
+    answers = [sources.answer(row, mapping) for row in mapping.rows]
+    for number in TABLES:
+        check_equal_protocols([answer for answer in answers if answer.row.table == number])
+    results = [Result.of(answer) for answer in answers]
+    others = [Result([found]) for found in sources.others(answers)]
+    if all(result.is_missing for result in results) and not others:
+        raise UserError(
+            f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "
+            "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
+        )
+    of_table = {number: [result for result in results if result.row.table == number] for number in TABLES}
+    documents = {f"table{number}": paper_table(number, of_table[number]) for number in TABLES}
+    documents["table3"] = comparison_table(compare(mapping.comparisons, results))
+    documents["others"] = other_table(others)
+    figures = _figures(of_table[1], of_table[2], others, method)
+    pictures = [Picture(name, caption, files[".svg"]) for name, (caption, files) in figures.items()]
+    tables = tuple(document.shown for document in documents.values())
+    files = {output / "index.html": page(tables, pictures, [*results, *others], output).encode()}
+    for stem, document in documents.items():
+        files |= {output / f"{stem}{suffix}": text.encode() for suffix, text in _formats(document).items()}
+    for name, (_, rendered) in figures.items():
+        files |= {output / "figures" / f"{name}{suffix}": content for suffix, content in rendered.items()}
+    return Publication(tables, files)
+
+
+def _formats(document: Document) -> dict[str, str]:
+    return {".md": document.shown.markdown(), ".csv": document.data.csv(), ".tex": document.shown.latex()}
+
+
+def _figures(
+    socket: Sequence[Result], transfer: Sequence[Result], others: Sequence[Result], method: Mapping[str, Any]
+) -> dict[str, tuple[str, dict[str, bytes]]]:
+    """Caption and files of each figure, by name."""
+    every = [*socket, *transfer, *others]
+    drawn = {
+        "figure1_overview": (
+            method_overview(method),
+            f"Figure 1. The method, as {method['name']} is configured.",
+        ),
+        "figure2_components": (
+            method_components(method),
+            f"Figure 2. What the generator of {method['name']} learns, and what its sublayers read.",
+        ),
+        "figure3_reward_latency": (
+            reward_latency(socket),
+            "Figure 3. Socket peg insertion: average reward against the time of a chunk. Bars are 95% intervals.",
+        ),
+        "figure4_ablations": (
+            transfer_ablations(transfer),
+            "Figure 4. Object transfer: ablations and rivals. Bars are 95% intervals.",
+        ),
+        "evaluations": (
+            success_by_evaluations(every),
+            "Success-like episodes against the number of network evaluations. Bars are Wilson's 95% intervals.",
+        ),
+        "learning": (
+            learning_curves(every),
+            "Training loss of every run above. Losses of different generators are measured in different units.",
+        ),
+        "failures": (failed_stages(every), "Where episodes end: the first stage that was not reached."),
+        "depth_attention": (
+            depth_attention(_depth_attention(every)),
+            "What the sublayers of trained policies read: mean Attention Residual weights over the action tokens.",
+        ),
+    }
+    return {name: (caption, render(figure)) for name, (figure, caption) in drawn.items()}
+
+
+def _depth_attention(results: Sequence[Result]) -> list[dict[str, Any]]:
+    runs = dict.fromkeys(found.evaluation.run for result in results for found in result.evaluated)
+    recorded = [found for run in runs if (found := read_depth_attention(run)) is not None]
+    return recorded[:MAX_HEAT_MAPS]
