@@ -1,0 +1,146 @@
+"""From run directories to all files of a report, or, where something is wrong, to one sentence and no file."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from synthetic_runs import answer_row, make_run, write_evaluation
+
+from imfvla import publication
+from imfvla.composition import compose
+from imfvla.errors import UserError
+from imfvla.publication import publish
+from imfvla.reporting.mapping import PATH, read_mapping
+
+MAPPING = read_mapping()
+ROWS = {row.name: row for row in MAPPING.rows}
+ANSWERED = ("socket_infer1", "socket_infer2", "socket_ddpm_ph32", "transfer_infer1", "transfer_native_dp")
+
+
+@pytest.fixture(scope="module")
+def method() -> dict:
+    return compose("train", ["+exp=socket_ph32_exec16"])
+
+
+@pytest.fixture
+def unrendered(monkeypatch):
+    """Figures are drawn but not rendered, which takes most of the time."""
+    monkeypatch.setattr(publication, "render", lambda figure: {".svg": b"<svg/>", ".png": b""})
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for index, name in enumerate(ANSWERED):
+        answer_row(tmp_path / "runs", ROWS[name], quality=0.4 + 0.1 * index)
+    return tmp_path / "runs"
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    found = sorted(path for path in directory.rglob("*") if path.is_file())
+    return {path.relative_to(directory).as_posix(): path.read_bytes() for path in found}
+
+
+def test_all_files_are_there_and_equal_on_equal_runs(runs, tmp_path, method):
+    for name in ("one", "other"):
+        publish([runs], tmp_path / name, MAPPING, method).write()
+    found = files(tmp_path / "one")
+    assert found == files(tmp_path / "other")
+    tables = {
+        f"{stem}{suffix}"
+        for stem in ("table1", "table2", "table3", "others")
+        for suffix in (".md", ".csv", ".tex")
+    }
+    assert tables | {"index.html"} == {name for name in found if "/" not in name}
+    figures = {name for name in found if name.startswith("figures/")}
+    assert len(figures) == 16
+    assert {
+        f"figures/{name}.png" for name in ("figure1_overview", "figure4_ablations", "learning")
+    } <= figures
+    assert all(found.values())
+    assert found["figures/failures.png"].startswith(b"\x89PNG")
+
+
+def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrendered):
+    publish([runs], tmp_path / "out", MAPPING, method).write()
+    folder = next(runs.glob("transfer_ph32_exec16/default/rollouts/*"))
+    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    line = next(
+        line
+        for line in (tmp_path / "out" / "table2.md").read_text().splitlines()
+        if "| ours | " in line and "missing" not in line and "infer1, ph32" in line
+    )
+    assert f"| {sum(row['total_reward'] for row in rows) / 100:.2f} [" in line
+    assert f"| {sum(row['success'] for row in rows)}/100 [" in line
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda runs: cut(runs, "episodes.jsonl"), r"episodes\.jsonl, line 100 is cut off"),
+        (lambda runs: cut(runs, "summary.json"), r"summary\.json cannot be read as JSON"),
+        (lambda runs: cut(runs, "metrics.jsonl", keep='{"st\n'), r"metrics\.jsonl, line 1 is no row of metrics"),
+        (lambda runs: answer_row(runs / "again", ROWS["socket_infer2"]), r"row 4 \(socket_infer2\) is answered twice"),
+        (lambda runs: answer_row(runs, ROWS["socket_act"], number=30), r"row 6 \(socket_act\) wants another protocol"),
+        (lambda runs: answer_row(runs, ROWS["socket_act"], variant="hard"), r"Table 1 mixes protocols: variant is"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_the_runs_is_told_and_nothing_written(
+    runs, tmp_path, method, unrendered, damage, message
+):
+    damage(runs)
+    with pytest.raises(UserError, match=message) as caught:
+        publish([runs], tmp_path / "out", MAPPING, method).write()
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def cut(runs: Path, name: str, keep: str | None = None) -> None:
+    path = next((runs / "socket_ph32_exec16").rglob(name))
+    path.write_text(path.read_text()[:-20] if keep is None else keep)
+
+
+def test_an_unknown_row_is_told_and_nothing_written(runs, tmp_path):
+    mapping = tmp_path / "tables.yaml"
+    mapping.write_text(PATH.read_text().replace("ACT (action chunking)", "ACT (chunking)"))
+    command = [sys.executable, "-m", "imfvla.report", f"directories=[{runs}]", f"output={tmp_path / 'out'}"]
+    done = subprocess.run([*command, f"mapping={mapping}"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert f"{mapping}, line " in done.stderr
+    assert (
+        "unknown row of the paper's Table 1 'ACT (chunking)' (did you mean ACT (action chunking)?)"
+        in done.stderr
+    )
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_run_at_all_is_told(tmp_path, method):
+    make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
+    with pytest.raises(UserError, match="No run with a finished evaluation below .*make one with"):
+        publish([tmp_path / "runs", tmp_path / "nothing"], tmp_path / "out", MAPPING, method)
+
+
+def test_evaluations_of_no_row_have_a_table_of_their_own(runs, tmp_path, method, unrendered):
+    run = make_run(runs / "socket_ph32_exec16" / "core=standard", "socket_ph32_exec16")
+    write_evaluation(run, 2, number=100)
+    publish([runs], tmp_path / "out", MAPPING, method).write()
+    found = files(tmp_path / "out")
+    assert b"socket_ph32_exec16/core=standard | 2 | step 600 of 600, seed 0 |" in found["others.md"]
+    assert b"core=standard" not in found["table1.md"]
+
+
+def test_the_command_needs_neither_torch_nor_a_simulator(runs, tmp_path):
+    check = (
+        "import sys; from imfvla import publication; from imfvla.report import main; "
+        "publication.render = lambda figure: {'.svg': b'', '.png': b''}; main(sys.argv[1:]); "
+        "assert not {'torch', 'mujoco', 'dm_control'} & set(sys.modules)"
+    )
+    arguments = [f"directories=[{runs}]", f"output={tmp_path / 'out'}"]
+    done = subprocess.run(
+        [sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Table 3: derived comparisons" in done.stdout
+    assert str(tmp_path / "out" / "index.html") in done.stdout
