@@ -1,0 +1,63 @@
+"""A number of a policy with its 95% interval, from one number an episode.
+
+Columns are (n,), or (S, n) where S training seeds met the same n starts; `bootstrap` says what the intervals are then.
+"""
+
+import numpy as np
+from scipy import stats
+
+from imfvla.reporting.bootstrap import TAILS, bootstrap
+from imfvla.reporting.measured import Measured
+from imfvla.reporting.metrics import wilson_interval
+
+
+def mean(values: np.ndarray) -> Measured:
+    return bootstrap(np.mean, values).measured
+
+
+def median(values: np.ndarray) -> Measured:
+    return bootstrap(np.median, values).measured
+
+
+def interquartile_mean(values: np.ndarray) -> Measured:
+    """Mean without the lowest and the highest quarter, each rounded down (R. Agarwal et al., arXiv:2108.13264)."""
+    return bootstrap(trimmed, values).measured
+
+
+def pooled_mean(totals: np.ndarray, counts: np.ndarray) -> Measured:
+    """Mean of positive numbers of which episodes have several each, such as the times of their replannings.
+
+    The interval is over episodes, found on logarithms. Without any number: Measured(None).
+    """
+    if not np.sum(counts):
+        return Measured(None)
+    return bootstrap(log_pooled_mean, totals, counts).exponential
+
+
+def share(happened: np.ndarray) -> Measured:
+    """Share of episodes in which something happened, with Wilson's interval.
+
+    Of several training seeds: with the number of episodes that would vary as much if all were independent, at most
+    all of them (N. Dean and M. Pagano, J. Surv. Stat. Methodol. 3, 2015), and Student's t. Where nothing varies that is the number of
+    starts.
+    """
+    happened = np.atleast_2d(happened)
+    value = float(happened.mean())
+    if len(happened) == 1:
+        return Measured(value, *wilson_interval(int(happened.sum()), happened.size))
+    found = bootstrap(np.mean, happened)
+    trials, score = happened.shape[1], stats.norm.ppf(TAILS[1])
+    if found.error:
+        trials = min(value * (1 - value) / found.error**2, happened.size)
+        score = stats.t.ppf(TAILS[1], found.freedom)
+    return Measured(value, *wilson_interval(value * trials, trials, score))
+
+
+def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The statistic of `interquartile_mean`."""
+    return stats.trim_mean(values, 0.25, axis=axis)
+
+
+def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The statistic of `pooled_mean`."""
+    return np.log(totals.sum(axis=axis)) - np.log(counts.sum(axis=axis))
