@@ -1,11 +1,11 @@
 """Bootstrap intervals, over episodes and, where a policy was trained several times, over training seeds too.
 
-Columns are numbers by episode: (n,) of one policy or (S, n) of S training seeds from the same n starts. A statistic
-takes columns and `axis`, as numpy's own do, and works on many resamples at once.
+A column holds a number for each episode: (n,) of one policy, or (S, n) of S training seeds from the same n starts. A
+statistic takes columns and `axis`, as numpy's own do, and works on many resamples at once.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +14,11 @@ from scipy import stats
 from imfvla.reporting.measured import Measured
 
 RESAMPLES = 10_000
-LEVEL = 0.95
-TAILS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
-NUMBERS_AT_ONCE = 4_000_000  # bounds the memory of a hierarchical bootstrap to a few arrays of 32 MB
+TAILS = (0.025, 0.975)
+NUMBERS_AT_ONCE = 2_000_000  # bounds what a hierarchical bootstrap needs to some arrays of 16 MB
 
 Statistic = Callable[..., np.ndarray]
+Columns = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,91 +37,108 @@ class Bootstrapped:
 
     @property
     def exponential(self) -> Measured:
-        """For a statistic that is a logarithm."""
+        """Of a statistic that is a logarithm; its value is None where it is not a number."""
         numbers = (self.value, self.low, self.high)
-        return Measured(*(None if number is None else float(np.exp(number)) for number in numbers))
+        known = (None if number is None or np.isnan(number) else float(np.exp(number)) for number in numbers)
+        return Measured(*known)
 
 
-def bootstrap(statistic: Statistic, *columns: np.ndarray) -> Bootstrapped:
-    """A statistic of paired columns, all (n,) or all (S, n), with an interval from 10,000 resamples of a fixed generator.
+def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstrapped:
+    """A statistic with an interval from 10,000 resamples of a fixed generator.
 
-    Of one training seed: BCa over episodes (B. Efron, JASA 82, 1987), and percentiles where the acceleration is not
-    defined, as for a median that no single episode moves. Of S > 1: `_hierarchical`. Equal numbers throughout give a point; one episode
-    or a value that is not finite has no interval.
+    With one training seed a policy: BCa over starts (B. Efron, JASA 82, 1987), and percentiles where the acceleration
+    is not defined, as for a median that no single episode moves. With several: `_hierarchical`. Equal numbers
+    throughout give a point; a single start, or a value that is not finite, has no interval.
+
+    Args:
+      statistic: takes the columns of all policies, one after the other.
+      policies: one column or several, each (n,) or (S, n); of all policies from the same n starts.
     """
-    columns = tuple(np.atleast_2d(np.asarray(column, float)) for column in columns)
-    if len({column.shape for column in columns}) != 1 or not columns[0].size:
-        raise ValueError(
-            f"Wanted columns of one shape, not empty, found {[column.shape for column in columns]}."
-        )
-    seeds, starts = columns[0].shape
+    policies = tuple(
+        tuple(np.atleast_2d(np.asarray(column, float)) for column in columns)
+        for columns in (columns if isinstance(columns, tuple) else (columns,) for columns in policies)
+    )
+    columns = [column for columns in policies for column in columns]
+    lengths = {column.shape[1] for column in columns}
+    if len(lengths) != 1 or not all(column.size for column in columns):
+        raise ValueError(f"Wanted columns of the same starts, found {[column.shape for column in columns]}.")
     with np.errstate(all="ignore"):
         value = float(statistic(*(column.ravel() for column in columns), axis=-1))
-        if starts < 2 or not np.isfinite(value):
+        if lengths == {1} or not np.isfinite(value):
             return Bootstrapped(value)
         if all(np.ptp(column) == 0 for column in columns):
             return Bootstrapped(value, value, value, 0.0)
-        if seeds > 1:
-            return _hierarchical(statistic, columns, value)
+        if max(map(len, columns)) > 1:
+            return _hierarchical(statistic, policies, value)
         return _accelerated(statistic, [column[0] for column in columns], value)
 
 
-def _accelerated(statistic: Statistic, columns: list[np.ndarray], value: float) -> Bootstrapped:
+def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: float) -> Bootstrapped:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is degenerate is handled below
+        warnings.simplefilter("ignore")  # scipy's, of what is handled below
         found = stats.bootstrap(
-            columns, statistic, paired=True, n_resamples=RESAMPLES, confidence_level=LEVEL, method="BCa",
-            rng=np.random.default_rng(0),
+            columns, statistic, paired=True, n_resamples=RESAMPLES, confidence_level=TAILS[1] - TAILS[0],
+            method="BCa", rng=np.random.default_rng(0),
         )  # fmt: skip
-    low, high = found.confidence_interval
-    distribution = found.bootstrap_distribution
+    distribution, (low, high) = found.bootstrap_distribution, found.confidence_interval
     if not np.isfinite([low, high]).all():
         low, high = _percentiles(distribution)
-    return Bootstrapped(value, float(low), float(high), float(np.std(distribution, ddof=1)))
+    error = float(np.std(distribution, ddof=1))
+    return Bootstrapped(value, float(low), float(high), error, columns[0].size - 1)
 
 
-def _hierarchical(statistic: Statistic, columns: tuple[np.ndarray, ...], value: float) -> Bootstrapped:
-    """Training seeds and starts are drawn independently, as every seed met the same starts (A. Owen, Ann. Appl. Stat. 1, 2007).
+def _hierarchical(statistic: Statistic, policies: Sequence[Columns], value: float) -> Bootstrapped:
+    """Starts and each policy's training seeds are drawn independently, since every seed met the same starts.
 
-    S - 1 of S seeds are drawn, which makes the variance between seeds unbiased (J. Rao and C. Wu, JASA 83, 1988), and
-    percentiles are stretched from the normal to Student's t, for S is small: its degrees of freedom are Satterthwaite's from
-    the variances over seeds alone and over starts alone.
+    That is the pigeonhole bootstrap (A. Owen, Ann. Appl. Stat. 1, 2007). Of S seeds S - 1 are drawn, which makes the
+    variance between seeds unbiased (J. Rao and C. Wu, JASA 83, 1988). As S is small, percentiles are moved away from
+    the value in the ratio of Student's t to the normal, with Satterthwaite's degrees of freedom from the variances
+    over starts alone and over each policy's seeds alone. A policy with one seed is taken as it is.
     """
-    seeds, starts = columns[0].shape
+    starts, counts = policies[0][0].shape[1], [len(columns[0]) for columns in policies]
     rng = np.random.default_rng(0)
-    both = _drawn(statistic, columns, rng, over_seeds=True, over_starts=True)
-    of_seeds = np.var(_drawn(statistic, columns, rng, over_seeds=True, over_starts=False))
-    of_starts = np.var(_drawn(statistic, columns, rng, over_seeds=False, over_starts=True))
-    variance = np.var(both, ddof=1)
-    freedom = variance**2 / (of_seeds**2 / (seeds - 1) + of_starts**2 / (starts - 1))
+    both = _drawn(statistic, policies, rng, over_seeds=[count > 1 for count in counts], over_starts=True)
+    nowhere = [False] * len(policies)
+    parts = [(np.var(_drawn(statistic, policies, rng, over_seeds=nowhere, over_starts=True)), starts - 1)]
+    for policy, count in enumerate(counts):
+        if count > 1:
+            here = [other == policy for other in range(len(policies))]
+            drawn = _drawn(statistic, policies, rng, over_seeds=here, over_starts=False)
+            parts.append((np.var(drawn), count - 1))
+    variance = np.var(both)
+    freedom = variance**2 / sum(part**2 / free for part, free in parts)
     freedom = float(freedom) if np.isfinite(freedom) else np.inf
     stretch = stats.t.ppf(TAILS[1], freedom) / stats.norm.ppf(TAILS[1])
-    low, high = (value + stretch * (end - value) for end in _percentiles(both))
-    return Bootstrapped(value, float(low), float(high), float(np.sqrt(variance)), freedom)
+    low, high = (float(value + stretch * (end - value)) for end in _percentiles(both))
+    return Bootstrapped(value, low, high, float(np.sqrt(variance)), freedom)
 
 
 def _drawn(
     statistic: Statistic,
-    columns: tuple[np.ndarray, ...],
+    policies: Sequence[Columns],
     rng: np.random.Generator,
     *,
-    over_seeds: bool,
+    over_seeds: Sequence[bool],
     over_starts: bool,
 ) -> np.ndarray:
-    """The statistic of each resample, (RESAMPLES,)."""
-    seeds, starts = columns[0].shape
-    block = max(1, NUMBERS_AT_ONCE // (seeds * starts))
+    """The statistic of each resample (RESAMPLES,), over the seeds of some policies, over starts, or over both."""
+    starts = policies[0][0].shape[1]
+    block = max(1, NUMBERS_AT_ONCE // max(columns[0].size for columns in policies))
     found = []
     for first in range(0, RESAMPLES, block):
         number = min(block, RESAMPLES - first)
-        rows = rng.integers(0, seeds, (number, seeds - 1)) if over_seeds else np.arange(seeds)[None]
         places = rng.integers(0, starts, (number, starts)) if over_starts else np.arange(starts)[None]
-        drawn = (column[rows[:, :, None], places[:, None, :]].reshape(number, -1) for column in columns)
-        found.append(statistic(*drawn, axis=-1))
+        drawn = []
+        for columns, draws in zip(policies, over_seeds, strict=True):
+            count = len(columns[0])
+            seeds = rng.integers(0, count, (number, count - 1)) if draws else np.arange(count)[None]
+            where = (seeds[:, :, None], places[:, None, :])
+            drawn += [np.broadcast_to(c[where], (number, *c[where].shape[1:])) for c in columns]
+        found.append(statistic(*(column.reshape(number, -1) for column in drawn), axis=-1))
     return np.concatenate(found)
 
 
 def _percentiles(distribution: np.ndarray) -> tuple[float, float]:
-    """Outer ends, without interpolation, since some may be infinite; resamples without any value do not count."""
+    """Outer ends without interpolation, as some may be infinite; resamples without any value do not count."""
     known = distribution[~np.isnan(distribution)]
     return np.quantile(known, TAILS[0], method="lower"), np.quantile(known, TAILS[1], method="higher")

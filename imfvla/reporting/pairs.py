@@ -1,78 +1,88 @@
-"""Two policies compared start by start: with how certain a difference, or why they cannot be paired."""
+"""Episodes of two policies from the same starts, or why they are none."""
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from imfvla.reporting.answers import Evaluated
-from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
-from imfvla.reporting.estimates import log_pooled_mean
-from imfvla.reporting.measured import Measured
-from imfvla.reporting.metrics import TIMING, Row, wilson_interval
-from imfvla.reporting.power import detectable_difference, detectable_share_difference
-from imfvla.reporting.significance import mcnemar, sign_flip
+from imfvla.reporting.metrics import Row
 
 SAME = ("task", "variant", "noise_seed", "max_steps")  # of two protocols whose episodes are pairs
 SAME_FOR_TIMES = ("threads", "workers")  # of two fingerprints, beside the machine
 
 
-@dataclass(frozen=True, slots=True)
-class Contrast:
-    """A difference or a ratio of two policies.
-
-    `p` is two-sided, of `test`, for no difference. `detectable` is the smallest one, in the unit of `result` and in our
-    favour, that so many pairs would have shown (see `power`); None where none is.
-    """
-
-    result: Measured
-    p: float | None
-    test: str
-    detectable: float | None
-
-
 class Pairs:
-    """Columns of two policies, (S, n) of S training seeds from the same n starts; S may differ between them.
+    """Episodes of two policies from the same starts, each with an evaluation for each of its training seeds.
 
-    `refusal` must have been None, for times too where times are compared.
+    `refusal` must have been None, with `times` where times are compared.
     """
 
     def __init__(self, ours: Sequence[Evaluated], theirs: Sequence[Evaluated]) -> None:
         self._ours, self._theirs = ours, theirs
 
-    def __len__(self) -> int:
-        """Starts."""
-        return len(self._ours[0].episodes)
-
     def columns(self, of: Callable[[Row], float]) -> tuple[np.ndarray, np.ndarray]:
-        """A number of each episode, ours and theirs."""
-        return _column(self._ours, of), _column(self._theirs, of)
+        """A number of each episode: ours (S, n) and theirs (T, n)."""
+        return tuple(
+            np.array([[of(row) for row in found.episodes] for found in policy], float)
+            for policy in (self._ours, self._theirs)
+        )
+
+    def policies(
+        self, ours: tuple[np.ndarray, ...], theirs: tuple[np.ndarray, ...]
+    ) -> tuple[tuple[np.ndarray, ...], ...]:
+        """The columns as `bootstrap` wants them: of two policies, or of one where both have the same weights."""
+        weights = [
+            [found.evaluation.summary["protocol"].get("weights") for found in policy]
+            for policy in (self._ours, self._theirs)
+        ]
+        return ((*ours, *theirs),) if weights[0] == weights[1] else (ours, theirs)
 
 
 def refusal(ours: Sequence[Evaluated], theirs: Sequence[Evaluated], *, times: bool = False) -> str | None:
-    """Why two policies' episodes are no pairs, as a clause without a full stop; None where they are.
+    """Why two policies' episodes are no pairs, as a clause; None where they are.
 
-    Each policy comes with an evaluation for each training seed. All must have met the same starts, by digest and in
-    number, with the same noise seed; with `times`, on the same kind of machine.
+    All evaluations must have met the same starts, by number and digest, with the same noise seed; with `times`, on
+    machines with the same fingerprint, with as many threads and workers.
     """
+    first, *others = [*ours, *theirs]
+    for other in others:
+        reason = _differing(first, other) or (_differing_machines(first, other) if times else None)
+        if reason:
+            return reason
+    return None
 
 
-def success_difference(pairs: Pairs) -> Contrast:
-    """Difference of success shares, with Newcombe's interval and the exact McNemar test."""
+def _differing(one: Evaluated, other: Evaluated) -> str | None:
+    names = _names(one, other)
+    ours, theirs = one.evaluation.summary["protocol"], other.evaluation.summary["protocol"]
+    for key in SAME:
+        if ours.get(key) != theirs.get(key):
+            return f"{key} is {ours.get(key)!r} of {names[0]} and {theirs.get(key)!r} of {names[1]}"
+    if len(one.episodes) != len(other.episodes):
+        return f"{names[0]} has {len(one.episodes)} episodes and {names[1]} {len(other.episodes)}"
+    for row, their_row in zip(one.episodes, other.episodes, strict=True):
+        if row["start_digest"] != their_row["start_digest"]:
+            return (
+                f"seed {row['seed']} of {names[0]} starts from {row['start_digest']} and seed {their_row['seed']} of "
+                f"{names[1]} from {their_row['start_digest']}"
+            )
+    return None
 
 
-def return_difference(pairs: Pairs) -> Contrast:
-    """Difference of mean returns, with a BCa interval over pairs and the sign-flip test."""
+def _differing_machines(one: Evaluated, other: Evaluated) -> str | None:
+    names = _names(one, other)
+    facts = []
+    for found in (one, other):
+        fingerprint, protocol = found.evaluation.summary["fingerprint"], found.evaluation.summary["protocol"]
+        more = {key: fingerprint.get(key) for key in SAME_FOR_TIMES}
+        facts.append(fingerprint["machine"] | more | {"device": protocol.get("device")})
+    ours, theirs = facts
+    differing = [key for key in (ours | theirs) if ours.get(key) != theirs.get(key)]
+    if not differing:
+        return None
+    values = ", ".join(f"{key} {ours.get(key)!r} and {theirs.get(key)!r}" for key in differing)
+    return f"{names[0]} and {names[1]} were timed on different machines: {values}"
 
 
-def return_ratio(pairs: Pairs) -> Contrast:
-    """Ratio of mean returns, ours over theirs, with a BCa interval over pairs and the sign-flip test of the difference.
-
-    Not a number where the mean return of theirs is 0, infinite where only an end of the interval lies there.
-    """
-
-
-def latency_ratio(pairs: Pairs) -> Contrast:
-    """Ratio of mean times of a chunk, ours over theirs, over pairs; the sign-flip test is of logarithms by episode."""
+def _names(*evaluated: Evaluated) -> list[str]:
+    return [str(found.evaluation.folder) for found in evaluated]

@@ -7,25 +7,26 @@ ALPHA = 0.05
 POWER = 0.8
 
 
-def detectable_share_difference(pairs: int, disagreement: float) -> float | None:
+def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float | None:
     """Smallest difference of two success shares that the exact McNemar test finds, None where it finds none.
 
-    With n pairs of which a share psi disagrees, M ~ Binomial(n, psi) do, and of these Binomial(M, (1 + delta / psi) / 2)
-    are for the better policy; the power is the probability that their number is significant given M. Solved
-    for a power of 0.8 exactly, where R. Connor (Biometrics 43, 1987) has the normal approximation
+    Of n pairs, M ~ Binomial(n, psi) disagree, and of these Binomial(M, (1 + delta / psi) / 2) in favour of the better
+    policy; the power is the probability that this number is significant given M. Solved for delta at a power of 0.8
+    without approximation; R. Connor's normal one (Biometrics 43, 1987) is
     delta = (z_0.975 sqrt(psi) + z_0.8 sqrt(psi - delta^2)) / sqrt(n).
 
     Args:
       pairs: n, the episodes of each policy.
-      disagreement: psi, in (0, 1]; 0.5 is the worst for policies whose successes have nothing in common.
+      disagreement: psi; a difference of more than that comes with as much. 0.5 is the worst for policies whose
+        successes have nothing to do with each other.
     """
 
-    def missing(difference: float) -> float:
-        return mcnemar_power(pairs, disagreement, difference) - POWER
+    def excess(difference: float) -> float:
+        return mcnemar_power(pairs, max(disagreement, difference), difference) - POWER
 
-    if missing(disagreement) < 0:
+    if excess(1.0) < 0:
         return None
-    return float(optimize.brentq(missing, 0.0, disagreement, xtol=1e-6))
+    return float(optimize.brentq(excess, 0.0, 1.0, xtol=1e-6))
 
 
 def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
@@ -35,7 +36,7 @@ def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
         ALPHA / 2, number, 0.5
     )  # of the worse side, to be significant; one too many at times
     most -= stats.binom.cdf(most, number, 0.5) > ALPHA / 2
-    better = (1 + difference / disagreement) / 2
+    better = 0.5 + 0.5 * difference / disagreement if disagreement else 0.5
     significant = stats.binom.cdf(most, number, 1 - better) + stats.binom.cdf(most, number, better)
     return float(stats.binom.pmf(number, pairs, disagreement) @ significant)
 

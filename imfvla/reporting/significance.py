@@ -24,8 +24,8 @@ def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
 def sign_flip(differences: np.ndarray) -> float:
     """p-value of the permutation test of paired differences (n,): were both alike, either sign would be as likely.
 
-    The statistic is the mean (R. Fisher, The Design of Experiments, 1935). Exact up to 16 pairs that differ, else from 100,000
-    flips of a fixed generator, the observed one counted in, so that it is never 0.
+    The statistic is the mean (R. Fisher, The Design of Experiments, 1935). Exact up to 16 pairs that differ, else from
+    100,000 flips of a fixed generator, the observed one counted in, so that it is never 0.
     """
     differences = np.asarray(differences, float)
     sizes = np.abs(differences[differences != 0])
