@@ -47,10 +47,10 @@ def share(happened: np.ndarray) -> Measured:
     if len(happened) == 1:
         return Measured(value, *wilson_interval(int(happened.sum()), happened.size))
     found = bootstrap(np.mean, happened)
-    trials, score = happened.shape[1], stats.norm.ppf(TAILS[1])
+    trials, score = happened.shape[1], float(stats.norm.ppf(TAILS[1]))
     if found.error:
         trials = min(value * (1 - value) / found.error**2, happened.size)
-        score = stats.t.ppf(TAILS[1], found.freedom)
+        score = float(stats.t.ppf(TAILS[1], found.freedom))
     return Measured(value, *wilson_interval(value * trials, trials, score))
 
 

@@ -29,7 +29,7 @@ def sign_flip(differences: np.ndarray) -> float:
     """
     differences = np.asarray(differences, float)
     sizes = np.abs(differences[differences != 0])
-    least = abs(differences.sum()) * (1 - 1e-12)  # sums of another order are equal to rounding
+    least = abs(differences.sum()) - 1e-12 * sizes.sum()  # equal sums differ in rounding
     if sizes.size <= MOST_EXACT:
         bits = np.arange(2**sizes.size)[:, None] >> np.arange(sizes.size) & 1
         return float((np.abs(2 * bits @ sizes - sizes.sum()) >= least).mean())
