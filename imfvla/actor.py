@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from imfvla.ensemble import TemporalEnsemble
 from imfvla.episode import Decision
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
@@ -48,6 +49,8 @@ class ChunkActor:
         self._seed = seed
         self._images: dict[int, np.ndarray] = {}
         self._states: dict[int, np.ndarray] = {}
+        decay = self._horizon.ensemble
+        self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
     def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
         """The action of `step`; looks and replans where the horizon says so.
@@ -69,7 +72,12 @@ class ChunkActor:
             )
             self._check(chunk[: self._horizon.exec])
             self._chunk, self._decided_at = chunk, step
-        action = np.clip(self._chunk[step - self._decided_at], self._minimum, self._maximum)
+        if self._ensemble is None:
+            action = self._chunk[step - self._decided_at]
+        else:
+            self._ensemble.add(step, self._chunk)
+            action = self._ensemble.action(step)
+        action = np.clip(action, self._minimum, self._maximum).astype(np.float32)
         return Decision(action=action, executed=action, images=images, chunk=chunk, inference_ms=inference_ms)
 
     @torch.inference_mode()

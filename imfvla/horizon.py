@@ -14,11 +14,15 @@ class Horizon:
     At the decision step `s` the policy sees the observations of steps `s - obs + 1 ... s` (the first one repeated
     where the episode has not begun yet), predicts the actions of steps `s ... s + pred - 1` and executes those of
     `s ... s + exec - 1`. Action `s` is applied right after observation `s`.
+
+    With `ensemble`, the decay of `imfvla.ensemble.TemporalEnsemble`, every step is a decision (exec = 1) and the
+    executed action is a mean over all chunks that cover it.
     """
 
     obs: int
     pred: int
     exec: int
+    ensemble: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("obs", "pred", "exec"):
@@ -29,6 +33,11 @@ class Horizon:
             raise UserError(
                 f"horizon.exec must not exceed horizon.pred: only predicted actions can be executed, "
                 f"found exec={self.exec} and pred={self.pred}; lower horizon.exec or raise horizon.pred."
+            )
+        if self.ensemble is not None and (self.ensemble < 0 or self.exec != 1):
+            raise UserError(
+                f"horizon.ensemble averages the chunks of all steps and needs horizon.exec=1 and a decay of at least "
+                f"0, found exec={self.exec} and ensemble={self.ensemble}; set horizon.exec=1 or horizon.ensemble=null."
             )
 
     def observed_steps(self, step: int) -> np.ndarray:

@@ -86,6 +86,13 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         if isinstance(reason, UserError):
             raise reason from None
         raise UserError(f"the configured policy cannot be built: {reason}") from error
+    wanted, found = policy.generator.core_interface, policy.core.interface
+    if wanted != found:
+        raise UserError(
+            f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
+            f"{config['core']['_target_']} is of the kind {found!r}: core=act and generator=act go together, and "
+            f"any other core with any other generator."
+        )
     if statistics is not None:
         policy.encoder.fit(torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max))
         policy.chunks.fit(statistics)

@@ -7,7 +7,7 @@ from imfvla.errors import UserError
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["+exp=nope"], r"Unknown exp 'nope': conf/exp has .*socket_ph32_exec16, transfer_ph32_exec16"),
+        (["+exp=nope"], r"Unknown exp 'nope': conf/exp has .*socket_ph32_exec16, .*transfer_ph32_exec16"),
         (["+exp=socket_ph32_exec1"], r"did you mean socket_ph32_exec16\?"),
         (["exp=socket_ph32_exec16"], r"write \+exp=socket_ph32_exec16 instead of exp=socket_ph32_exec16"),
         (["+epx=socket_ph32_exec16"], r"Unknown key epx: at the top are .*training"),
@@ -34,7 +34,7 @@ def test_gives_plain_values():
     config = compose("train", ["horizon.pred=8", "horizon.exec=4"])
     assert type(config) is type(config["horizon"]) is dict
     assert type(config["observation"]["views"]) is list
-    assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4}
+    assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4, "ensemble": None}
     assert config["observation"]["num_views"] == len(config["observation"]["views"])
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS, tokenize
 from imfvla.policy import build_policy
@@ -99,6 +100,14 @@ def test_loss_is_unchanged_by_garbage_in_padded_steps():
     garbage = data.actions.clone()
     garbage[~data.valid] = torch.nan
     assert torch.equal(loss(made, data), loss(made, Batch(data.obs, garbage, data.valid)))
+
+
+@pytest.mark.parametrize("groups", [["generator=act"], ["core=act"]])
+def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
+    with pytest.raises(
+        UserError, match=r"^generator imfvla\.generators\..* core imfvla\.nn\..*: core=act and"
+    ):
+        build_policy(compose("train", groups))
 
 
 def test_loss_is_a_pure_function_of_batch_and_generator():

@@ -16,6 +16,8 @@ from imfvla.errors import UserError
 class Generator(Protocol):
     """One algorithm: how to learn from chunks, how to turn noise into a chunk. Works on normalised actions."""
 
+    core_interface: str  # how it calls the core: "flow" is core(z, t, r, context); "style" is ACT's
+
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:

@@ -60,6 +60,8 @@ class DenoisingDiffusion:
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
     """
 
+    core_interface = "flow"
+
     def __init__(
         self,
         *,

@@ -17,6 +17,8 @@ class Regression:
     clip: normalised actions lie within [-clip, clip]; the prediction is clamped there.
     """
 
+    core_interface = "flow"
+
     def __init__(self, *, clip: float) -> None:
         self.clip = clip
 

@@ -32,6 +32,8 @@ class LinearPath:
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
     """
 
+    core_interface = "flow"
+
     def __init__(
         self,
         *,

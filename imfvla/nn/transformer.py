@@ -89,6 +89,7 @@ class TransformerCore(nn.Module):
     `max_rad` is the highest frequency of the time embeddings. Raises ValueError where `patch` does not divide `steps`.
     """
 
+    interface = "flow"
     block: type[nn.Module] = Block
 
     def __init__(

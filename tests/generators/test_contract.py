@@ -8,12 +8,13 @@ from torch import nn
 
 from imfvla.composition import CONFIG_DIRECTORY, compose
 from imfvla.errors import UserError
+from imfvla.nn.act import ActCore
 from imfvla.nn.residual import AttentionResidual
 from imfvla.nn.transformer import TransformerCore
 
 GENERATORS = sorted(path.stem for path in (CONFIG_DIRECTORY / "generator").glob("*.yaml"))
 TIMES = sorted(path.stem for path in (CONFIG_DIRECTORY / "generator" / "times").glob("*.yaml"))
-MOST = {"l1": 1, "ddpm": 100}
+MOST = {"l1": 1, "ddpm": 100, "act": 1}
 BATCH, STEPS, CHANNELS = 3, 4, 2
 
 every_generator = pytest.mark.parametrize("name", GENERATORS)
@@ -23,8 +24,13 @@ def make(name, *overrides):
     return instantiate(compose("train", [f"generator={name}", *overrides])["generator"], _convert_="all")
 
 
-def make_core():
+def make_core(name="imf"):
     torch.manual_seed(0)
+    if name == "act":
+        return ActCore(
+            steps=STEPS, channels=CHANNELS, width=8, heads=2, depth=1, decoder_depth=1, style_depth=1,
+            style_width=3, state_token=-1, mlp_ratio=2.0, dropout=0.0,
+        ).eval()  # fmt: skip
     core = TransformerCore(
         steps=STEPS,
         channels=CHANNELS,
@@ -61,7 +67,7 @@ def sample(generator, core, noise, nfe):
 
 @every_generator
 def test_a_loss_for_each_chunk_that_reaches_every_weight(name):
-    core = make_core()
+    core = make_core(name)
     value, logs = loss(make(name), core)
     assert value.shape == (BATCH,)
     assert all(
@@ -75,7 +81,7 @@ def test_a_loss_for_each_chunk_that_reaches_every_weight(name):
 
 @every_generator
 def test_the_loss_is_a_pure_function_of_its_arguments(name):
-    core, generator = make_core(), make(name)
+    core, generator = make_core(name), make(name)
     assert torch.equal(loss(generator, core)[0], loss(generator, core)[0])
 
 
@@ -84,14 +90,23 @@ def test_steps_that_are_not_valid_have_no_error_of_their_own(name):
     """A core that does not look at the actions tells the error of padded steps from what they show the network."""
 
     class Blind(nn.Module):
-        def forward(self, x, t, r, context):
-            return torch.zeros_like(x)
+        def forward(self, *inputs):
+            return torch.zeros(len(inputs[0]), STEPS, CHANNELS)
+
+        def style(self, context, actions, valid):
+            return torch.zeros(2, BATCH, 3)
 
     _, actions, valid = inputs()
     garbage = actions.masked_fill(~valid.unsqueeze(-1), 100.0)
     generator = make(name)
     found, expected = (
-        generator.loss(Blind(), Context(), x, valid, torch.Generator().manual_seed(2))[0]
+        generator.loss(
+            Blind(),
+            torch.zeros(BATCH, 2, 8) if name == "act" else Context(),
+            x,
+            valid,
+            torch.Generator().manual_seed(2),
+        )[0]
         for x in (garbage, actions)
     )
     assert torch.equal(found, expected)
@@ -99,7 +114,7 @@ def test_steps_that_are_not_valid_have_no_error_of_their_own(name):
 
 @every_generator
 def test_the_sample_is_a_pure_function_of_its_noise(name):
-    core, generator = make_core(), make(name)
+    core, generator = make_core(name), make(name)
     noise = torch.randn(BATCH, STEPS, CHANNELS, generator=torch.Generator().manual_seed(3))
     for nfe in (n for n in (1, 2, 3, 100) if n <= MOST.get(name, n)):
         before = noise.clone()
@@ -118,15 +133,19 @@ def test_sampling_evaluates_the_core_nfe_times(name, nfe):
     class Counted(nn.Module):
         calls = 0
 
-        def forward(self, x, t, r, context):
+        def forward(self, *inputs):
             self.calls += 1
-            assert x.shape[:1] == t.shape == r.shape
-            assert ((r >= 0) & (r <= t) & (t <= 1)).all()
-            return torch.zeros_like(x)
+            if name != "act":
+                x, t, r, _ = inputs
+                assert x.shape[:1] == t.shape == r.shape
+                assert ((r >= 0) & (r <= t) & (t <= 1)).all()
+            return torch.zeros(1, STEPS, CHANNELS)
+
+        style_width = 3
 
     core, generator = Counted(), make(name)
     if nfe > MOST.get(name, nfe):
-        with pytest.raises(UserError, match=f"must be 1.*l1.*found {nfe}"):
+        with pytest.raises(UserError, match=f"must be 1.*{name}.*found {nfe}"):
             generator.sample(core, None, torch.zeros(1, STEPS, CHANNELS), nfe)
     else:
         generator.sample(core, None, torch.zeros(1, STEPS, CHANNELS), nfe)
