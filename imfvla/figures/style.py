@@ -53,6 +53,9 @@ def new_figure(width: float, height: float) -> Figure:
 def render(figure: Figure) -> dict[str, bytes]:
     """Content by suffix: ".svg" and ".png", without dates and versions."""
     content = {}
+    with style():
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # places are found: the formats need not find them again
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         stream = io.BytesIO()
         with style():

@@ -3,24 +3,40 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from scipy import stats
-
+from imfvla.reporting.contrasts import (
+    return_difference,
+    return_ratio,
+    speedup,
+    success_difference,
+    success_ratio,
+)
 from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.results import Result, latencies, returns, successes
+from imfvla.reporting.pairs import Pairs, refusal
+from imfvla.reporting.results import Result
+from imfvla.reporting.significance import holm
 
-COLUMNS = {
-    "avg_return": returns,
-    "success_episodes": successes,
-    "inference_ms_mean": latencies,
-    "inference_fps": latencies,
+TIMES = ("inference_ms_mean", "inference_fps")
+CONTRASTS = {  # metric and operation -> function, and whether it takes row and baseline the other way round
+    ("avg_return", "ratio"): (return_ratio, False),
+    ("avg_return", "inverse_ratio"): (return_ratio, True),
+    ("avg_return", "difference"): (return_difference, False),
+    ("success_episodes", "ratio"): (success_ratio, False),
+    ("success_episodes", "inverse_ratio"): (success_ratio, True),
+    ("success_episodes", "difference"): (success_difference, False),
+    ("inference_ms_mean", "ratio"): (speedup, True),
+    ("inference_ms_mean", "inverse_ratio"): (speedup, False),
+    ("inference_fps", "ratio"): (speedup, False),
+    ("inference_fps", "inverse_ratio"): (speedup, True),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A row of Table 3. `result` is None where a row is missing or `refused` says why it cannot be had."""
+    """A row of Table 3. `result` is None where a row is missing or `refused` says why it cannot be had.
+
+    `detectable` is the smallest result in favour of the row that so many pairs would have shown (see `Contrast`).
+    """
 
     comparison: Comparison
     row: Result
@@ -28,6 +44,8 @@ class Compared:
     result: Measured | None = None
     p: float | None = None
     p_holm: float | None = None
+    test: str | None = None
+    detectable: float | None = None
     refused: str | None = None
 
     @property
@@ -38,31 +56,28 @@ class Compared:
 def compare(comparisons: Sequence[Comparison], results: Sequence[Result]) -> list[Compared]:
     """Each comparison on our rows, p-values corrected over all of them."""
     named = {result.name: result for result in results}
-    return [_compare(c, named[c.row.name], named[c.baseline.name]) for c in comparisons]
+    compared = [_compare(c, named[c.row.name], named[c.baseline.name]) for c in comparisons]
+    corrected = holm([found.p for found in compared])
+    return [replace(found, p_holm=p) for found, p in zip(compared, corrected, strict=True)]
 
 
 def _compare(comparison: Comparison, row: Result, baseline: Result) -> Compared:
     compared = Compared(comparison, row, baseline)
     if compared.is_missing:
         return compared
-    refused = None
-    if len(row.evaluated) != len(baseline.evaluated):
-        refused = f"{row.name} has {len(row.evaluated)} training seeds and {baseline.name} {len(baseline.evaluated)}"
-    if refused:
-        return replace(compared, refused=refused)
-    column = COLUMNS[comparison.of]
-    ours, theirs = column(row.episodes).astype(float), column(baseline.episodes).astype(float)
-    is_inverse = (comparison.operation == "inverse_ratio") != (comparison.of == "inference_fps")
-
-    def statistic(a, b, axis=-1):
-        if comparison.operation == "difference":
-            return a.sum(axis=axis) - b.sum(axis=axis)
-        a, b = a.mean(axis=axis), b.mean(axis=axis)
-        return b / a if is_inverse else a / b
-
-    interval = stats.bootstrap(
-        (ours, theirs), statistic, paired=True, rng=np.random.default_rng(0)
-    ).confidence_interval
-    return replace(
-        compared, result=Measured(float(statistic(ours, theirs)), float(interval.low), float(interval.high))
-    )
+    if (comparison.of, comparison.operation) not in CONTRASTS:
+        reason = f"{comparison.operation} of {comparison.of} is not offered: take a ratio"
+        return replace(compared, refused=reason)
+    reason = refusal(row.evaluated, baseline.evaluated, times=comparison.of in TIMES)
+    if reason:
+        return replace(compared, refused=reason)
+    contrast, is_turned = CONTRASTS[comparison.of, comparison.operation]
+    policies = (row.evaluated, baseline.evaluated)
+    found = contrast(Pairs(*(reversed(policies) if is_turned else policies)))
+    result, detectable = found.result, found.detectable
+    if contrast is success_difference:  # of episodes, as the paper prints it
+        starts = len(row.evaluated[0].episodes)
+        result, detectable = result.scaled(starts), None if detectable is None else starts * detectable
+    elif is_turned and detectable is not None:
+        detectable = 1 / detectable
+    return replace(compared, result=result, p=found.p, test=found.test, detectable=detectable)

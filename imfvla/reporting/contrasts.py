@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from scipy import stats
@@ -36,7 +37,7 @@ def success_difference(pairs: Pairs) -> Contrast:
 
     With several training seeds: bootstrap, and the tests of `return_difference`.
     """
-    ours, theirs = pairs.columns(lambda row: row["success"])
+    ours, theirs = pairs.columns(itemgetter("success"))
     if max(len(ours), len(theirs)) > 1:
         return _difference(pairs, ours, theirs)
     ours, theirs = ours[0] > 0, theirs[0] > 0
@@ -50,7 +51,7 @@ def return_difference(pairs: Pairs) -> Contrast:
     With several training seeds, these are a sample too: p is then the greater one of that test, of the seeds' means by
     start, and of Student's t with the error and the degrees of freedom of the bootstrap.
     """
-    return _difference(pairs, *pairs.columns(lambda row: row["total_reward"]))
+    return _difference(pairs, *pairs.columns(itemgetter("total_reward")))
 
 
 def return_ratio(pairs: Pairs) -> Contrast:
@@ -58,10 +59,12 @@ def return_ratio(pairs: Pairs) -> Contrast:
 
     Found on logarithms. Infinite where the mean of theirs is 0, None where ours is 0 too.
     """
-    ours, theirs = pairs.columns(lambda row: row["total_reward"])
-    found = bootstrap(_log_ratio, *pairs.policies((ours,), (theirs,)))
-    tested = _difference(pairs, ours, theirs)
-    return Contrast(found.exponential, tested.p, tested.test, _detectable_ratio(found))
+    return _ratio(pairs, "total_reward")
+
+
+def success_ratio(pairs: Pairs) -> Contrast:
+    """As `return_ratio`, of success shares."""
+    return _ratio(pairs, "success")
 
 
 def speedup(pairs: Pairs) -> Contrast:
@@ -87,6 +90,13 @@ def _difference(pairs: Pairs, ours: np.ndarray, theirs: np.ndarray) -> Contrast:
     p, test = _p_value(ours, theirs, found)
     detectable = detectable_difference(found.error, found.freedom) if found.error else None
     return Contrast(found.measured, p, test, detectable)
+
+
+def _ratio(pairs: Pairs, key: str) -> Contrast:
+    ours, theirs = pairs.columns(itemgetter(key))
+    found = bootstrap(_log_ratio, *pairs.policies((ours,), (theirs,)))
+    tested = _difference(pairs, ours, theirs)
+    return Contrast(found.exponential, tested.p, tested.test, _detectable_ratio(found))
 
 
 def _p_value(ours: np.ndarray, theirs: np.ndarray, found: Bootstrapped) -> tuple[float, str]:

@@ -1,11 +1,11 @@
 """The numbers of a row of the tables, with their intervals, from the episodes of its evaluations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
+from imfvla.reporting import estimates
 from imfvla.reporting.answers import Answer, Evaluated
 from imfvla.reporting.mapping import TableRow
 from imfvla.reporting.measured import Measured
@@ -80,14 +80,13 @@ class Result:
     def metrics(self) -> dict[str, Measured]:
         """By name: those of `metrics.summarise`, `iqm_return` and shares, with intervals where there are any."""
         if self.is_missing:
-            names = (*SUMMARISED, *BOOTSTRAPPED, "nonzero_share", "success_share", "inference_fps")
+            names = (*SUMMARISED, *ESTIMATED, "inference_fps")
             return dict.fromkeys(names, Measured(None))
         summary = summarise(self.episodes)
         metrics = {name: Measured(summary[name]) for name in SUMMARISED}
-        for name, (column, statistic) in BOOTSTRAPPED.items():
-            metrics[name] = _bootstrapped([column(found.episodes) for found in self.evaluated], statistic)
-        for name in ("nonzero", "success"):
-            metrics[f"{name}_share"] = _share(summary[f"{name}_episodes"], summary["episodes"])
+        for name, (estimate, *columns) in ESTIMATED.items():
+            by_seed = (np.stack([column(found.episodes) for found in self.evaluated]) for column in columns)
+            metrics[name] = estimate(*by_seed)
         latency = metrics["inference_ms_mean"]
         rates = (None if ms is None else 1000 / ms for ms in (latency.value, latency.high, latency.low))
         metrics["inference_fps"] = Measured(*rates)
@@ -96,7 +95,10 @@ class Result:
     @cached_property
     def paper_success_share(self) -> Measured:
         """The share printed in the paper, with the interval that its count deserves."""
-        return _share(self.paper.success, self.paper.episodes) if self.paper else Measured(None)
+        if not self.paper:
+            return Measured(None)
+        count, number = self.paper.success, self.paper.episodes
+        return Measured(count / number, *wilson_interval(count, number))
 
 
 def returns(episodes: Sequence[Row]) -> np.ndarray:
@@ -107,46 +109,32 @@ def highest_rewards(episodes: Sequence[Row]) -> np.ndarray:
     return np.array([row["max_reward"] for row in episodes], float)
 
 
-def latencies(episodes: Sequence[Row]) -> np.ndarray:
-    """Mean time of a chunk in each episode [ms]; episodes without any are left out."""
-    return np.array(
-        [np.mean(row[TIMING]["inference_ms"]) for row in episodes if row[TIMING]["inference_ms"]], float
-    )
+def inference_times(episodes: Sequence[Row]) -> np.ndarray:
+    """Sum of the times of an episode's chunks [ms]."""
+    return np.array([sum(row[TIMING]["inference_ms"]) for row in episodes], float)
+
+
+def num_inferences(episodes: Sequence[Row]) -> np.ndarray:
+    return np.array([len(row[TIMING]["inference_ms"]) for row in episodes], int)
 
 
 def successes(episodes: Sequence[Row]) -> np.ndarray:
     return np.array([row["success"] for row in episodes], bool)
 
 
-def _share(count: int, number: int) -> Measured:
-    return Measured(count / number, *wilson_interval(count, number))
-
-
-def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    return stats.trim_mean(values, 0.25, axis=axis)
-
-
-def _bootstrapped(groups: Sequence[np.ndarray], statistic: Callable[..., np.ndarray]) -> Measured:
-    """PROVISIONAL until the statistics are there."""
-    values = np.concatenate(groups)
-    if not values.size:
-        return Measured(None)
-    value = float(statistic(values))
-    if np.ptp(values) == 0:
-        return Measured(value, value, value)
-    found = stats.bootstrap(
-        (values,), statistic, n_resamples=10_000, rng=np.random.default_rng(0)
-    ).confidence_interval
-    return Measured(value, float(found.low), float(found.high))
+def rewarded(episodes: Sequence[Row]) -> np.ndarray:
+    return returns(episodes) > 0
 
 
 SUMMARISED = (
     "max_return", "nonzero_episodes", "success_episodes", "control_fps", "inference_ms_median", "inference_ms_p95",
 )  # fmt: skip
-BOOTSTRAPPED = {
-    "avg_return": (returns, np.mean),
-    "median_return": (returns, np.median),
-    "iqm_return": (returns, interquartile_mean),
-    "mean_max_reward": (highest_rewards, np.mean),
-    "inference_ms_mean": (latencies, np.mean),
+ESTIMATED = {
+    "avg_return": (estimates.mean, returns),
+    "median_return": (estimates.median, returns),
+    "iqm_return": (estimates.interquartile_mean, returns),
+    "mean_max_reward": (estimates.mean, highest_rewards),
+    "inference_ms_mean": (estimates.pooled_mean, inference_times, num_inferences),
+    "nonzero_share": (estimates.share, rewarded),
+    "success_share": (estimates.share, successes),
 }

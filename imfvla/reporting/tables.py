@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from imfvla.reporting.comparisons import Compared
 from imfvla.reporting.mapping import LAST, Comparison
 from imfvla.reporting.measured import Measured
+from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import TITLES, PaperRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, Table, interval, number, with_interval
@@ -72,7 +73,9 @@ def paper_table(number: int, results: Sequence[Result], notes: Sequence[str] = (
         cells.append((result.row.label, str(result.nfe), "ours", *ours(result)))
         keys.append((result.name,))
     missing = tuple((result.row.label, result.answer.command) for result in results if result.is_missing)
-    every = (*(text for text in (_described(results),) if text), INTERVALS, *notes)
+    first = [result.evaluated[0].episodes for result in results if not result.is_missing]
+    described = (_described(results), detectable_success(len(first[0]))) if first else ()
+    every = (*described, INTERVALS, *notes)
     return Document(
         Table(TITLES[number], COLUMNS, tuple(cells), every, tuple(keys), missing),
         Table(TITLES[number], *_data(results)),
@@ -104,6 +107,9 @@ def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) ->
         for result in (found.row, found.baseline)
         if result.is_missing
     }
+    measured = [found for found in compared if found.result]
+    if measured:
+        notes = (*notes, *pairing(measured))
     refused = tuple(
         f"{found.comparison.paper.label}: refused, as {found.refused}." for found in compared if found.refused
     )
@@ -190,8 +196,6 @@ def _weights(result: Result) -> str:
 def _described(results: Sequence[Result]) -> str:
     """The protocol that all rows of a table share, and the machines that their latencies are of."""
     found = [evaluated.evaluation for result in results for evaluated in result.evaluated]
-    if not found:
-        return ""
     protocol, seeds = found[0].summary["protocol"], found[0].seeds
     machines = list(dict.fromkeys(machine(evaluation.summary) for evaluation in found))
     task = f"{protocol['task']} ({protocol['variant']})"

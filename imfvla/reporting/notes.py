@@ -1,0 +1,38 @@
+"""What stands below the tables about how sure they are."""
+
+from collections.abc import Sequence
+
+from imfvla.reporting.comparisons import Compared
+from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
+
+
+def detectable_success(pairs: int) -> str:
+    """Which difference of successes so many episodes of two policies show."""
+    share = detectable_share_difference(pairs)
+    if share is None:
+        return f"{pairs} pairs of episodes show no difference of two policies' successes at p = {ALPHA}, however large."
+    return (
+        f"Smallest detectable difference: {pairs} pairs of episodes show one of {100 * share:.0f} percentage points "
+        f"between two policies' successes with probability {POWER} at p = {ALPHA} (exact McNemar) where both "
+        "disagree on half of the starts, and smaller ones where they disagree on fewer."
+    )
+
+
+def pairing(compared: Sequence[Compared]) -> tuple[str, ...]:
+    """How measured comparisons were made, and what they would have shown."""
+    tests = ", ".join(dict.fromkeys(found.test for found in compared))
+    each = "; ".join(f"{found.comparison.paper.label} {_detectable(found)}" for found in compared)
+    return (
+        "Ours: pairs of episodes from the same starts with the same noise seed. In brackets: 95% intervals, of "
+        "differences of counts Newcombe's, else BCa bootstrap over pairs; with several training seeds bootstrap over "
+        f"these too. p: two-sided ({tests}); Holm over {sum(found.p is not None for found in compared)} comparisons.",
+        f"Smallest detectable results in favour of the row, with probability {POWER} at p = {ALPHA}, each comparison "
+        f"by itself: {each}.",
+    )
+
+
+def _detectable(found: Compared) -> str:
+    if found.detectable is None:
+        return "none"
+    is_difference = found.comparison.operation == "difference"
+    return f"{found.detectable:+.1f}" if is_difference else f"{found.detectable:.2f}×"
