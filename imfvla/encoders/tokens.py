@@ -1,4 +1,4 @@
-"""From feature maps to a few tokens per view: the whole map through a matrix, or learned spatial attention.
+"""From feature maps to tokens of each view: the whole map through a matrix, learned spatial attention, or patches.
 
 Shapes: B batch, V views, C channels, h w feature map, P = h w positions, M attention maps, K tokens per view, D width.
 """
@@ -72,6 +72,28 @@ class AttendedTokens(nn.Module):
         pooled = pooled.unflatten(2, (self.tokens, -1)).flatten(3)
         tokens = torch.einsum("bvki,vkid->bvkd", pooled, self.output) + self.identity
         return tokens.flatten(1, 2)
+
+
+class PatchTokens(nn.Module):
+    """Each square of `factor` x `factor` features as one token: pixel shuffle, then a matrix (arXiv 2504.05299).
+
+    Tokens per view: those squares that cover the map, which is padded with zeros at its lower and right edge.
+    (B, V, C, h, w) -> (B, V * tokens, width).
+    """
+
+    def __init__(self, *, views: int, channels: int, grid: tuple[int, int], width: int, factor: int) -> None:
+        super().__init__()
+        self.factor = factor
+        self.padding = tuple(-size % factor for size in grid)
+        self.tokens = math.prod(math.ceil(size / factor) for size in grid)
+        self.connector = nn.Linear(channels * factor**2, width)
+        self.identity = nn.Parameter(0.02 * torch.randn(views, self.tokens, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = over_last_axis(x.flatten(3)).unflatten(3, x.shape[3:])
+        below, right = self.padding
+        patches = F.pixel_unshuffle(F.pad(x, (0, right, 0, below)), self.factor)
+        return (self.connector(patches.flatten(3).transpose(2, 3)) + self.identity).flatten(1, 2)
 
 
 def over_last_axis(x: Tensor) -> Tensor:

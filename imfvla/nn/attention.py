@@ -3,7 +3,7 @@
 PyTorch's fused attention kernels have no forward-mode derivative; the explicit form is exact and, at the short
 sequences of a policy, as quick.
 
-Shapes: B batch, L queries, P prefix or context tokens, D width, N heads, E = D / N.
+Shapes: B batch, L queries, P prefix or context tokens, D width, N heads, E width of a head.
 """
 
 import torch
@@ -23,37 +23,49 @@ def head_width(width: int, heads: int) -> int:
 
 
 class Attention(nn.Module):
-    """Self-attention whose queries also see the cached keys and values of a prefix that does not see them."""
+    """Self-attention whose queries also see the cached keys and values of a prefix that does not see them.
 
-    def __init__(self, width: int, heads: int) -> None:
+    `inner` is the width N * E of all heads together, `width` where it is not given.
+    """
+
+    def __init__(self, width: int, heads: int, inner: int | None = None) -> None:
         super().__init__()
-        scale = head_width(width, heads) ** -0.5
+        inner = inner or width
+        scale = head_width(inner, heads) ** -0.5
         self.heads = heads
-        self.query_key_value = Linear(width, 3 * width, bias=False)
+        self.query_key_value = Linear(width, 3 * inner, bias=False)
         with torch.no_grad():  # the usual scale of the scores, as part of the queries' weights
-            self.query_key_value.weight[:width] *= scale
-        self.output = Linear(width, width, bias=False)
+            self.query_key_value.weight[:inner] *= scale
+        self.output = Linear(inner, width, bias=False)
 
     def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
         """Queries (B, N, L, E), and the keys and values of x (B, L, D)."""
         q, k, v = self.query_key_value(x).unflatten(-1, (3, self.heads, -1)).unbind(-3)
         return q.transpose(1, 2), (k.permute(0, 2, 3, 1), v.transpose(1, 2))
 
-    def attend(self, q: Tensor, own: KeyValue, prefix: KeyValue | None = None) -> Tensor:
-        """Attention output (B, L, D) of the queries over prefix and own tokens."""
+    def attend(
+        self, q: Tensor, own: KeyValue, prefix: KeyValue | None = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """Attention output (B, L, D) of the queries over prefix and own tokens.
+
+        `mask` (L, L) is added to the scores of own tokens: -inf where a query (row) does not see a token (column).
+        """
         keys, values = own
+        scores = q @ keys
+        if mask is not None:
+            scores = affine(scores, None, mask)
         if prefix is None:
-            mixed = (q @ keys).softmax(-1) @ values
+            mixed = scores.softmax(-1) @ values
         else:
             # One softmax over two score blocks: cheaper than concatenating the cached keys and values each time.
             num_prefix = prefix[0].shape[-1]
-            weights = torch.cat((affine(q, prefix[0]), q @ keys), dim=-1).softmax(-1)
+            weights = torch.cat((affine(q, prefix[0]), scores), dim=-1).softmax(-1)
             mixed = affine(weights[..., :num_prefix], prefix[1]) + weights[..., num_prefix:] @ values
         return self.output(mixed.transpose(1, 2).flatten(2))
 
-    def forward(self, x: Tensor, prefix: KeyValue | None = None) -> Tensor:
+    def forward(self, x: Tensor, prefix: KeyValue | None = None, mask: Tensor | None = None) -> Tensor:
         q, own = self.project(x)
-        return self.attend(q, own, prefix)
+        return self.attend(q, own, prefix, mask)
 
 
 class CrossAttention(nn.Module):

@@ -82,6 +82,44 @@ def take_weights(
             parameter.copy_(found[name])
 
 
+class Backbone:
+    """Mixin of a module most of which can be pretrained and frozen: all parameters but those that begin as `own` says.
+
+    Both parts of a policy, `key` "encoder" and "core", take theirs from one file: the checkpoint of another policy.
+    """
+
+    key: str
+    own: tuple[str, ...]
+    pretrained: str | None
+
+    def set_backbone(self, pretrained: str | None, frozen: bool) -> None:
+        """Remembers the file and freezes; last in the constructor."""
+        if frozen and pretrained is None:
+            raise UserError(
+                f"{self.key}.frozen=true needs {self.key}.pretrained, found null: name the safetensors file with the "
+                f"weights to keep, or train them with {self.key}.frozen=false."
+            )
+        self.pretrained = pretrained
+        if frozen:
+            for parameter in self.backbone().values():
+                parameter.requires_grad_(False)
+
+    def backbone(self) -> dict[str, nn.Parameter]:
+        """The pretrained part by name."""
+        return {name: p for name, p in self.named_parameters() if not name.startswith(self.own)}
+
+    def initialise_from_pretrained(self) -> None:
+        """Takes the backbone from the file, where one is configured."""
+        if self.pretrained is None:
+            return
+        where, prefix = f"{self.key}.pretrained", f"{self.key}."
+        read = read_weights(self.pretrained, where)
+        found = {name.removeprefix(prefix): x for name, x in read.items() if name.startswith(prefix)}
+        mine = {name: x for name, x in found.items() if not name.startswith(self.own)}
+        what = f"{where}={self.pretrained} does not fit this {self.key}"
+        take_weights(self.backbone(), mine, (), what)
+
+
 def _listed(names: Collection[str]) -> str:
     shown = ", ".join(sorted(names)[:SHOWN])
     return f"{shown} and {len(names) - SHOWN} more" if len(names) > SHOWN else shown

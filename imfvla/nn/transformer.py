@@ -31,7 +31,7 @@ class Conditioning:
     """The context of a batch as a core's `condition` prepares it."""
 
     blocks: tuple[KeyValue, ...]  # of every block that attends to the context
-    summary: Tensor  # (B, D), of the last context token
+    summary: Tensor | None = None  # (B, D), of the last context token
 
     def repeat(self, times: int) -> "Conditioning":
         """Each row `times` times in succession: (B, ...) -> (B * times, ...)."""
@@ -48,7 +48,7 @@ class Conditioning:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Conditioning":
         blocks = tuple((function(keys), function(values)) for keys, values in self.blocks)
-        return Conditioning(blocks, function(self.summary))
+        return Conditioning(blocks, None if self.summary is None else function(self.summary))
 
 
 class SwiGLU(nn.Module):
