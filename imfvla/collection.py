@@ -177,7 +177,10 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     env, expert = _stage_for(settings)
     path = _path(directory, seed)
     sink = McapSink(path, lossless=True, render_every=settings.camera_every)
-    result = run_episode(env, expert, seed, [sink], kind="demonstration", config=asdict(settings))
+    sentences = {"paraphrases": env.paraphrases}
+    result = run_episode(
+        env, expert, seed, [sink], kind="demonstration", config=asdict(settings), metadata=sentences
+    )
     if not result.success:
         path.unlink()
     return seed, result.success

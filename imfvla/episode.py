@@ -18,7 +18,7 @@ ACTION_NAMES = tuple(
 class EpisodeInfo:
     """What is known when an episode begins."""
 
-    task: str  # "socket" | "transfer"
+    task: str  # "socket" | "transfer" | "combined"
     kind: str  # "demonstration" | "rollout"
     seed: int  # handed to reset; draws the start state
     start_digest: str  # hex digest of the start state
@@ -66,6 +66,7 @@ class EpisodeResult:
     failure: str | None  # label of an abnormal end ("non-finite action", ...), None for a normal one
     inference_ms: tuple[float, ...]  # one per replanning
     wall_s: float
+    goal: str | None = None  # the task that the episode was about, where its scene serves several
 
 
 class Actor(Protocol):

@@ -114,6 +114,7 @@ def run_episode(
             failure=failure,
             inference_ms=tuple(inference_ms),
             wall_s=time.perf_counter() - began,
+            goal=getattr(env, "goal", None),
         )
         for sink in sinks:
             sink.end(result)

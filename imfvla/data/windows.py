@@ -3,8 +3,6 @@
 Shapes: B batch, W windows, To observed steps, Tp predicted steps, V views, L instruction words.
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 import torch
 
@@ -25,20 +23,15 @@ class Windows:
     looked; recordings with gaps would leave only the first step of each episode and are refused with a
     UserError.
 
-    `paraphrases` adds sentences, by task, to those recorded with each episode.
+    With `paraphrases` an item's sentence is drawn among all that were recorded for its episode, otherwise it is the one
+    that was said.
     """
 
-    def __init__(
-        self,
-        store: FrameStore,
-        horizon: Horizon,
-        *,
-        paraphrases: Mapping[str, Sequence[str]] | None = None,
-    ) -> None:
+    def __init__(self, store: FrameStore, horizon: Horizon, *, paraphrases: bool = True) -> None:
         self.store = store
         self.horizon = horizon
         self._index_windows()
-        self._index_instructions(paraphrases or {})
+        self._index_instructions(paraphrases)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -92,11 +85,11 @@ class Windows:
         self._followed = np.array(followed)  # (W, Tp)  rows of store.action
         self._valid = np.array(valid)  # (W, Tp)
 
-    def _index_instructions(self, paraphrases: Mapping[str, Sequence[str]]) -> None:
+    def _index_instructions(self, paraphrases: bool) -> None:
         sentences: list[str] = []
         first, count = [], []
         for episode in self.store.episodes:
-            known = dict.fromkeys((*episode.instructions, *paraphrases.get(episode.task, ())))
+            known = dict.fromkeys(episode.instructions if paraphrases else episode.instructions[:1])
             first.append(len(sentences))
             count.append(len(known))
             sentences.extend(known)

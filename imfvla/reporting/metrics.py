@@ -24,6 +24,7 @@ def row_of(result: EpisodeResult) -> dict[str, Any]:
         "success": bool(result.success),
         "first_step_of_stage": list(result.first_step_of_stage),
         "failure": result.failure,
+        **({"goal": result.goal} if result.goal else {}),
         TIMING: {
             "wall_s": round(result.wall_s, 6),
             "inference_ms": [round(value, 3) for value in result.inference_ms],
@@ -62,8 +63,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "inference_ms_median": float(np.median(inference_ms)) if timed else None,
         "inference_ms_p95": float(np.percentile(inference_ms, 95)) if timed else None,
         "success_interval": list(wilson_interval(successes, len(rows))),
+        **({"success_of_goal": success_of_goal(rows)} if "goal" in rows[0] else {}),
         "failures": dict(sorted(Counter(row["failure"] for row in rows if row["failure"]).items())),
     }
+
+
+def success_of_goal(rows: Sequence[Row]) -> dict[str, list[int]]:
+    """By what was asked for, where one scene serves several tasks: [successes, episodes]."""
+    counts: dict[str, list[int]] = {}
+    for row in rows:
+        count = counts.setdefault(row["goal"], [0, 0])
+        count[0] += bool(row["success"])
+        count[1] += 1
+    return dict(sorted(counts.items()))
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:

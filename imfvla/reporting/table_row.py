@@ -52,6 +52,8 @@ def table_of(found: Sequence[Evaluation]) -> Table:
     for evaluation in found:
         if paper_of(evaluation) and evaluation.row.checkpoint != LAST:
             note += f" The paper's row of nfe {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
+        for goal, (successes, episodes) in evaluation.summary.get("success_of_goal", {}).items():
+            note += f" Nfe {evaluation.nfe}, asked for {goal}: {successes}/{episodes}."
         for label, count in evaluation.summary["failures"].items():
             note += f" Nfe {evaluation.nfe}: {count} ended as failed, {label}."
     return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), (note,))

@@ -1,4 +1,7 @@
-"""RoboIMI's two bimanual tasks in dm_control. Importing this package picks the GL backend and does nothing else."""
+"""RoboIMI's two bimanual tasks in dm_control, and both in one scene.
+
+Importing this package picks the GL backend and does nothing else.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -11,7 +14,7 @@ if TYPE_CHECKING:
 
 select_gl_backend()  # before anything imports mujoco
 
-NAMES = tuple(TEXTS)
+NAMES = (*TEXTS, "combined")
 VARIANTS = ("easy", "default", "hard")
 VIEWS = ("front", "top", "r_wrist")
 
@@ -26,7 +29,7 @@ def load(
     image_size: tuple[int, int] = (96, 96),
     views: tuple[str, ...] = VIEWS,
 ) -> "BimanualEnvironment":
-    """Builds the task `name` ("socket" or "transfer").
+    """Builds the task `name`: "socket", "transfer", or "combined", the things of both and one sentence an episode.
 
     Args:
         seed: drawn from by `reset()` without a seed of its own.
@@ -37,13 +40,15 @@ def load(
     Raises:
         UserError: unknown task, variant or view.
     """
-    text_for(name)
+    if name not in NAMES:
+        raise UserError(f"There is no task {name!r}; choose one of {', '.join(sorted(NAMES))}.")
     if variant not in VARIANTS:
         raise UserError(f"task.variant must be one of {', '.join(VARIANTS)}, found {variant!r}.")
     # mujoco is imported here, after the backend is chosen and only by those who simulate.
     from imfvla.tasks.bimanual import BimanualEnvironment
+    from imfvla.tasks.combined import CombinedTask
     from imfvla.tasks.socket import SocketTask
     from imfvla.tasks.transfer import TransferTask
 
-    task = {"socket": SocketTask, "transfer": TransferTask}[name](variant)
+    task = {"socket": SocketTask, "transfer": TransferTask, "combined": CombinedTask}[name](variant)
     return BimanualEnvironment(task, seed=seed, image_size=image_size, views=views)

@@ -64,7 +64,8 @@ class _Ids:
 class BimanualTask(composer.Task):
     """Two arms, one table and some props. Subclasses place the props and say which stage holds.
 
-    Attributes for subclasses to set: `name`, `num_stages`, `ranges` (prop name -> StartRange).
+    Attributes for subclasses to set: `name`, `num_stages`, `ranges` (prop name -> StartRange). `goal` is the task whose
+    stages hold and whose sentence is said: the task itself, but in a scene that serves several.
     """
 
     name: str
@@ -90,6 +91,18 @@ class BimanualTask(composer.Task):
     @property
     def task_observables(self) -> OrderedDict:
         return self._observables
+
+    @property
+    def goal(self) -> str:
+        return self.name
+
+    def begin(self, seed: int) -> np.random.RandomState:
+        """What the start state of the episode `seed` is drawn from."""
+        return np.random.RandomState(seed)
+
+    def draw_starts(self, random_state: np.random.RandomState) -> dict[str, tuple[float, float, float]]:
+        """x, y [m] and yaw [rad] of each prop at the start."""
+        return {name: self.ranges[name].draw(random_state) for name in self.props}
 
     def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         model = physics.model
@@ -123,11 +136,10 @@ class BimanualTask(composer.Task):
         arm = np.concatenate([home_joints(), [START_OPENING * FINGER_TRAVEL] * 2])
         physics.data.qpos[self._ids.start] = np.concatenate([arm, arm])
         physics.data.ctrl[:] = np.tile(np.concatenate([home_joints(), [START_OPENING]]), 2)
-        for name, prop in self.props.items():
-            x, y, yaw = self.ranges[name].draw(random_state)
+        for name, (x, y, yaw) in self.draw_starts(random_state).items():
             at = self._ids.free[name]
             physics.data.qpos[at : at + 7] = (
-                *(x, y, prop.rest_height),
+                *(x, y, self.props[name].rest_height),
                 *(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
             )
 
@@ -225,6 +237,11 @@ class BimanualEnvironment(composer.Environment):
         return self.task.variant
 
     @property
+    def goal(self) -> str | None:
+        """The task that the present episode is about, where the scene serves several."""
+        return None if self.task.goal == self.name else self.task.goal
+
+    @property
     def num_stages(self) -> int:
         return self.task.num_stages
 
@@ -235,17 +252,18 @@ class BimanualEnvironment(composer.Environment):
 
     @property
     def instruction(self) -> str:
-        return text_for(self.name)[0]
+        """The sentence of the present episode."""
+        return text_for(self.task.goal)[0]
 
     @property
     def paraphrases(self) -> tuple[str, ...]:
-        return text_for(self.name)[1]
+        return text_for(self.task.goal)[1]
 
     def reset(self, seed: int | None = None) -> dm_env.TimeStep:
         """Starts an episode; `seed` alone draws its start state. Without one the construction seed's next is taken."""
         if seed is None:
             seed = int(self._seeds.randint(2**31))
-        self._random_state = np.random.RandomState(seed)
+        self._random_state = self.task.begin(seed)
         timestep = super().reset()
         start = np.round(np.asarray(self.physics.data.qpos), 9) + 0.0
         self._start_digest = hashlib.sha256(start.tobytes()).hexdigest()[:16]

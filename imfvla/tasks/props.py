@@ -17,6 +17,9 @@ ORANGE = (0.95, 0.45, 0.05, 1.0)
 YELLOW = (0.98, 0.90, 0.10, 1.0)
 BLUE = (0.10, 0.25, 0.90, 1.0)
 MAGENTA = (0.90, 0.10, 0.65, 1.0)
+GREEN = (0.05, 0.60, 0.25, 1.0)
+
+Color = tuple[float, float, float, float]
 
 _SOLID = {
     "type": "box",
@@ -39,12 +42,10 @@ class Prop(composer.Entity):
         self._root = mjcf.RootElement(model=name)
         self._root.compiler.angle = "radian"
 
-    def _box(
-        self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...], **more
-    ) -> None:
+    def _box(self, name: str, pos: tuple[float, ...], half: tuple[float, ...], rgba: Color, **more) -> None:
         self._root.worldbody.add("geom", name=name, pos=pos, size=half, rgba=rgba, **_SOLID, **more)
 
-    def _paint(self, pos: tuple[float, ...], half: tuple[float, ...], rgba: tuple[float, ...]) -> None:
+    def _paint(self, pos: tuple[float, ...], half: tuple[float, ...], rgba: Color) -> None:
         self._root.worldbody.add(
             "geom", type="box", pos=pos, size=half, rgba=rgba, contype=0, conaffinity=0, mass=0
         )  # fmt: skip
@@ -57,12 +58,12 @@ class Prop(composer.Entity):
 class Bar(Prop):
     """A square bar along x. Both ends carry the same cap, so that half a turn changes nothing one could see."""
 
-    def _build(self, name: str, length: float, cap: float = 0.02) -> None:
+    def _build(self, name: str, length: float, color: Color = ORANGE, cap: float = 0.02) -> None:
         super()._build(name)
         self.length = length
         self.rest_height = BAR_WIDTH / 2
         half = BAR_WIDTH / 2
-        self._box("bar", (0, 0, 0), (length / 2, half, half), ORANGE)
+        self._box("bar", (0, 0, 0), (length / 2, half, half), color)
         for sign in (-1, 1):
             skin = half + 3e-4
             self._paint((sign * (length - cap) / 2, 0, 0), (cap / 2 + 2e-4, skin, skin), YELLOW)

@@ -55,25 +55,26 @@ class SocketTask(BimanualTask):
         )
         self.ranges = dict(zip(("socket", "peg"), RANGES[variant], strict=True))
 
-    def fit(self, physics: mjcf.Physics) -> Fit:
-        """Measures the peg against the socket."""
-        socket, peg = self.prop_pose(physics, "socket"), self.prop_pose(physics, "peg")
-        return measure_fit(socket, peg)
-
     def stage(self, physics: mjcf.Physics) -> int:
-        contacts = self.contacts(physics)
-        if not (self.holds(contacts, "left", "socket") and self.holds(contacts, "right", "peg")):
-            return 0
-        for name, prop in self.props.items():
-            if self.prop_pose(physics, name).position[2] < prop.rest_height + LIFTED:
-                return 1
-        fit = self.fit(physics)
-        aside = float(np.abs(fit.aside).max())
-        play = (self.props["socket"].aperture - BAR_WIDTH) / 2 + 0.002
-        if fit.depth > INSIDE and aside < play and fit.angle < INSIDE_ANGLE:
-            return 5 if fit.depth >= SEATED else 4
-        near = abs(fit.depth) < AT_MOUTH and aside < AT_MOUTH_ASIDE and fit.angle < AT_MOUTH_ANGLE
-        return 3 if near else 2
+        return insertion_stage(self, physics)
+
+
+def insertion_stage(task: BimanualTask, physics: mjcf.Physics) -> int:
+    """How far the things "socket" and "peg" of a task are: 0 ... 5."""
+    contacts = task.contacts(physics)
+    if not (task.holds(contacts, "left", "socket") and task.holds(contacts, "right", "peg")):
+        return 0
+    socket, peg = (task.prop_pose(physics, name) for name in ("socket", "peg"))
+    for name, pose in (("socket", socket), ("peg", peg)):
+        if pose.position[2] < task.props[name].rest_height + LIFTED:
+            return 1
+    fit = measure_fit(socket, peg)
+    aside = float(np.abs(fit.aside).max())
+    play = (task.props["socket"].aperture - BAR_WIDTH) / 2 + 0.002
+    if fit.depth > INSIDE and aside < play and fit.angle < INSIDE_ANGLE:
+        return 5 if fit.depth >= SEATED else 4
+    near = abs(fit.depth) < AT_MOUTH and aside < AT_MOUTH_ASIDE and fit.angle < AT_MOUTH_ANGLE
+    return 3 if near else 2
 
 
 def measure_fit(socket: Pose, peg: Pose) -> Fit:

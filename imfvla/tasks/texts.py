@@ -7,9 +7,9 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
         "insert the peg into the socket",
         (
             "put the peg into the socket",
-            "push the orange bar through the blue socket",
+            "push the orange peg through the blue socket",
             "pick up peg and socket and plug them together",
-            "plug the bar into the ring",
+            "plug the peg into the ring",
             "join the peg and the socket in the air",
         ),
     ),
@@ -17,7 +17,7 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
         "hand the bar over to the left arm",
         (
             "pass the bar from the right gripper to the left gripper",
-            "give the orange bar to the left arm",
+            "give the bar to the left arm",
             "transfer the bar to the other hand",
             "pick up the bar with the right arm and hand it to the left",
             "let the left gripper take over the bar",

@@ -25,14 +25,19 @@ class TransferTask(BimanualTask):
         self.ranges = {"bar": RANGES[variant]}
 
     def stage(self, physics: mjcf.Physics) -> int:
-        contacts = self.contacts(physics)
-        left, right = (self.holds(contacts, side, "bar") for side in ("left", "right"))
-        height = self.prop_pose(physics, "bar").position[2] - self.props["bar"].rest_height
-        lifted = height > LIFTED and not self.on_table(contacts, "bar")
-        if left and lifted:
-            if not self.touches(contacts, "right", "bar"):
-                return 4
-            return 3 if right else 0
-        if right:
-            return 2 if lifted else 1
-        return 0
+        return transfer_stage(self, physics)
+
+
+def transfer_stage(task: BimanualTask, physics: mjcf.Physics) -> int:
+    """How far the thing "bar" of a task is: 0 ... 4."""
+    contacts = task.contacts(physics)
+    left, right = (task.holds(contacts, side, "bar") for side in ("left", "right"))
+    height = task.prop_pose(physics, "bar").position[2] - task.props["bar"].rest_height
+    lifted = height > LIFTED and not task.on_table(contacts, "bar")
+    if left and lifted:
+        if not task.touches(contacts, "right", "bar"):
+            return 4
+        return 3 if right else 0
+    if right:
+        return 2 if lifted else 1
+    return 0

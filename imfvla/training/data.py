@@ -19,7 +19,8 @@ def prepare_windows(config: Mapping[str, Any], demonstrations: Path) -> Windows:
         store = FrameStore.build(
             demonstrations, store_path, observation["image_size"], observation["views"], progress=progress
         )
-    return Windows(store, build(Horizon, config["horizon"], "horizon"))
+    horizon = build(Horizon, config["horizon"], "horizon")
+    return Windows(store, horizon, paraphrases=config["task"]["paraphrases"])
 
 
 def make_loader(config: Mapping[str, Any], windows: Windows) -> Loader:

@@ -90,3 +90,8 @@ def test_wilson_holds_the_share_and_mirrors(counts):
 def test_wilson_refuses_what_is_no_share(successes, trials):
     with pytest.raises(ValueError, match="0 <= successes <= trials"):
         wilson_interval(successes, trials)
+
+
+def test_successes_are_counted_by_goal_where_a_scene_serves_several_tasks():
+    rows = [row_of(result(seed, 1.0, 5.0 * (seed < 3), goal=("a", "b")[seed % 2])) for seed in range(5)]
+    assert summarise(rows)["success_of_goal"] == {"a": [2, 3], "b": [1, 2]}

@@ -2,10 +2,11 @@
 
 from imfvla.errors import UserError
 from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.combined import CombinedExpert
 from imfvla.tasks.experts.socket import SocketExpert
 from imfvla.tasks.experts.transfer import TransferExpert
 
-_EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert}
+_EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert, "combined": CombinedExpert}
 
 
 def make_expert(name: str, *, modes: int, noise: float) -> Expert:

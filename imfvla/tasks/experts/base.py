@@ -91,9 +91,9 @@ class Expert:
 
     def reset(self, env: BimanualEnvironment, seed: int) -> None:
         """Draws the style of the episode `seed` and forgets the last one."""
-        if env.name != self.task_name:
-            raise UserError(f"The expert of {self.task_name!r} was given the task {env.name!r}.")
         task = env.task
+        if task.goal != self.task_name:
+            raise UserError(f"The expert of {self.task_name!r} was given the task {task.goal!r}.")
         self.task = task
         self.hands = {side: Hand(task, side, ArmKinematics(env.physics.model.ptr, side)) for side in SIDES}
         rng = np.random.default_rng(np.random.SeedSequence([seed, _STYLE_STREAM]))
