@@ -1,0 +1,212 @@
+"""Eight Gaussians in the plane: what a generator makes of many modes, without pictures and robots.
+
+The modes lie on a circle of radius 2, deviation 0.1, all scaled to unit variance. A generator is judged by samples: its
+energy distance to fresh data, the modes it reaches, and the share of samples within four deviations of a mode.
+
+Shapes: B batch, N samples; a sample is a chunk of one step with two channels.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from imfvla.generators.base import UniformTimes
+from imfvla.generators.ddpm import DenoisingDiffusion
+from imfvla.generators.flow import FlowMatching
+from imfvla.generators.imf import ImprovedMeanFlow
+from imfvla.nn.embeddings import TimeEmbedding
+from imfvla.nn.linear import Linear
+from imfvla.training.ema import Ema
+
+NUM_MODES, RADIUS, DEVIATION, SCALE = 8, 2.0, 0.1, 1 / math.sqrt(2)
+SIGMAS = 4.0
+LEAST_SHARE_OF_MODE = 0.5  # of the samples that are due to a mode, for it to count as reached
+BATCH, RATE = 512, 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """How samples compare with data."""
+
+    energy_distance: float
+    modes: int  # of 8 that were reached
+    near: float  # share of samples within four deviations of a mode
+
+    @property
+    def passes(self) -> bool:
+        return self.energy_distance < 0.01 and self.modes == NUM_MODES and self.near >= 0.85
+
+
+def centres() -> Tensor:
+    """(8, 2) of the modes."""
+    angles = torch.arange(NUM_MODES) * (2 * math.pi / NUM_MODES)
+    return SCALE * RADIUS * torch.stack((angles.cos(), angles.sin()), dim=-1)
+
+
+def draw(count: int, rng: torch.Generator) -> Tensor:
+    """Data (count, 2)."""
+    modes = torch.randint(NUM_MODES, (count,), generator=rng)
+    return centres()[modes] + SCALE * DEVIATION * torch.randn(count, 2, generator=rng)
+
+
+def judge(samples: Tensor, rng: torch.Generator) -> Quality:
+    """Samples (N, 2) against as many fresh data."""
+    data = draw(len(samples), rng)
+    distance, mode = torch.cdist(samples, centres()).min(dim=1)
+    near = distance < SIGMAS * SCALE * DEVIATION
+    counts = torch.bincount(mode[near], minlength=NUM_MODES)
+    due = LEAST_SHARE_OF_MODE * len(samples) / NUM_MODES
+    return Quality(energy_distance(samples, data), int((counts >= due).sum()), float(near.float().mean()))
+
+
+def energy_distance(x: Tensor, y: Tensor) -> float:
+    """2 E|x - y| - E|x - x'| - E|y - y'| of samples (N, 2), without bias (G. Szekely and M. Rizzo, 2013)."""
+
+    def within(z: Tensor) -> Tensor:
+        return torch.cdist(z, z).sum() / (len(z) * (len(z) - 1))
+
+    return float(2 * torch.cdist(x, y).mean() - within(x) - within(y))
+
+
+class PlaneCore(nn.Module):
+    """A residual MLP (x, t, r) -> x, of the kind that flow generators drive; the context is not used."""
+
+    def __init__(self, width: int, depth: int) -> None:
+        super().__init__()
+        self.input = Linear(2, width)
+        self.time = TimeEmbedding(width, max_rad=1.0)
+        self.interval = TimeEmbedding(width, max_rad=1.0)
+        self.blocks = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(width, elementwise_affine=False),
+                Linear(width, width),
+                nn.SiLU(),
+                Linear(width, width),
+            )
+            for _ in range(depth)
+        )
+        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.output = Linear(width, 2)
+
+    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Any) -> Tensor:
+        """x (B, 1, 2), times (B,) -> (B, 1, 2)."""
+        condition = self.time(t) + self.interval(t - r)
+        hidden = self.input(x[:, 0]) + condition
+        for block in self.blocks:
+            hidden = hidden + block(hidden + condition)
+        return self.output(self.norm(hidden)).unsqueeze(1)
+
+
+class NoContext:
+    """The context of a core that needs none."""
+
+    def repeat(self, times: int) -> "NoContext":
+        return self
+
+    detach = rows = repeat
+
+
+class FlippedMeanFlow(ImprovedMeanFlow):
+    """iMF with the sign of its derivative flipped: a mistake that the judgement must find."""
+
+    def derivative(self, *arguments: Any) -> tuple[Tensor, Tensor]:
+        u, dudt = super().derivative(*arguments)
+        return u, -dudt
+
+
+PATH = {
+    "parametrisation": "velocity",
+    "times": UniformTimes(),
+    "time_power": 0.0,
+    "adaptive_offset": 1e-3,
+    "draws": 1,
+    "clip": 10.0,
+}
+MEAN_FLOW = {
+    **PATH,
+    "adaptive_power": 0.5,
+    "boundary_share": 0.1,
+    "instant_weight": 1.0,
+    "compound_target": "sample",
+    "compound_draws": 1,
+}
+GENERATORS: dict[str, Callable[[], Any]] = {
+    "iMF": lambda: ImprovedMeanFlow(**MEAN_FLOW),
+    "iMF, sign flipped": lambda: FlippedMeanFlow(**MEAN_FLOW),
+    "flow matching": lambda: FlowMatching(**PATH, adaptive_power=0.0),
+    "DDPM": lambda: DenoisingDiffusion(
+        num_levels=100, prediction="epsilon", clip_sample=True, draws=1, clip=2.5
+    ),
+}
+CASES = (  # generator, evaluations, whether it has to pass
+    ("iMF", 1, True),
+    ("flow matching", 100, True),
+    ("DDPM", 100, True),
+    ("flow matching", 1, False),
+    ("iMF, sign flipped", 1, False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A generator's samples in so many evaluations, and what they are worth."""
+
+    generator: str
+    nfe: int
+    must_pass: bool
+    samples: Tensor
+    quality: Quality
+
+    @property
+    def is_as_expected(self) -> bool:
+        return self.quality.passes == self.must_pass
+
+    def row(self) -> dict[str, Any]:
+        named = {"generator": self.generator, "nfe": self.nfe, "must_pass": self.must_pass}
+        return {**named, **asdict(self.quality), "passes": self.quality.passes}
+
+
+def train(
+    generator: Any, *, steps: int, seed: int, width: int = 128, depth: int = 4, advance: Callable[[], None]
+) -> nn.Module:
+    """The averaged weights of a core that `generator` has trained; calls `advance` after each step."""
+    torch.manual_seed(seed)
+    core = PlaneCore(width, depth)
+    ema = Ema(core, 0.999)
+    optimiser = torch.optim.Adam(core.parameters(), RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    rng = torch.Generator().manual_seed(seed)
+    valid = torch.ones(BATCH, 1, dtype=torch.bool)
+    for step in range(steps):
+        loss, _ = generator.loss(core, NoContext(), draw(BATCH, rng).unsqueeze(1), valid, rng)
+        optimiser.zero_grad()
+        loss.mean().backward()
+        nn.utils.clip_grad_norm_(core.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        ema.update(step)
+        advance()
+    return ema.policy
+
+
+@torch.no_grad()
+def sample(generator: Any, core: nn.Module, count: int, nfe: int, seed: int) -> Tensor:
+    """(count, 2) in `nfe` evaluations."""
+    noise = torch.randn(count, 1, 2, generator=torch.Generator().manual_seed(seed + 1))
+    return generator.sample(core, NoContext(), noise, nfe)[:, 0]
+
+
+def run_cases(*, steps: int, samples: int, seed: int, advance: Callable[[], None]) -> list[Case]:
+    """All cases, each generator trained once."""
+    made = {name: build() for name, build in GENERATORS.items()}
+    cores = {name: train(made[name], steps=steps, seed=seed, advance=advance) for name in made}
+    found = []
+    for name, nfe, must_pass in CASES:
+        drawn = sample(made[name], cores[name], samples, nfe, seed)
+        quality = judge(drawn, torch.Generator().manual_seed(seed + 2))
+        found.append(Case(name, nfe, must_pass, drawn, quality))
+    return found
