@@ -90,8 +90,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
     if wanted != found:
         raise UserError(
             f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
-            f"{config['core']['_target_']} is of the kind {found!r}: core=act and generator=act go together, and "
-            f"any other core with any other generator."
+            f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
+            f"core.velocity_head=true with generator.v_from=head, any other core with any other generator."
         )
     if statistics is not None:
         policy.encoder.fit(torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max))

@@ -102,10 +102,12 @@ def test_loss_is_unchanged_by_garbage_in_padded_steps():
     assert torch.equal(loss(made, data), loss(made, Batch(data.obs, garbage, data.valid)))
 
 
-@pytest.mark.parametrize("groups", [["generator=act"], ["core=act"]])
+@pytest.mark.parametrize(
+    "groups", [["generator=act"], ["core=act"], ["core.velocity_head=true"], ["generator.v_from=head"]]
+)
 def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
     with pytest.raises(
-        UserError, match=r"^generator imfvla\.generators\..* core imfvla\.nn\..*: core=act and"
+        UserError, match=r"^generator imfvla\.generators\..* core imfvla\.nn\..*: core=act goes"
     ):
         build_policy(compose("train", groups))
 

@@ -130,6 +130,7 @@ MEAN_FLOW = {
     **PATH,
     "adaptive_power": 0.5,
     "boundary_share": 0.1,
+    "v_from": "boundary",
     "instant_weight": 1.0,
     "compound_target": "sample",
     "compound_draws": 1,

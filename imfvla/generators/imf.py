@@ -5,8 +5,8 @@ V = u + (t - r) sg(du/dt) is regressed on the conditional velocity e - x (paper 
 along the marginal flow: the Jacobian-vector product of u in the direction (v, 0, 1) (eq. 6), v = u(z_t, t, t) from the
 same network. The gradient flows through the primal u alone.
 
-Beside the compound loss, the instantaneous case u(z_t, t, t) that the tangent needs anyway is regressed on e - x too
-("dual pass", arXiv 2608.16153).
+Beside the compound loss, the instantaneous velocity that the tangent needs anyway is regressed on e - x too ("dual
+pass", arXiv 2608.16153). It is the boundary case u(z_t, t, t), or the output of a second head of the core.
 
 Shapes: B batch, N draws per observation, H steps, A action.
 """
@@ -24,22 +24,38 @@ from imfvla.generators.velocity import AverageVelocity, interpolate
 class ImprovedMeanFlow(AverageVelocity):
     """Learns and samples an average velocity.
 
-    instant_weight: weight of the loss on u(z_t, t, t), the flow-matching part.
+    v_from: where v comes from: "boundary", u(z_t, t, t), or "head", a second output layer of the core.
+    instant_weight: weight of the loss on v, the flow-matching part.
     compound_target: "sample" regresses V on e - x (paper); "network" on v, the same network's estimate of its mean.
     compound_draws: how many draws of an observation enter the compound loss too.
     The rest as in `AverageVelocity`.
     """
 
     def __init__(
-        self, *, instant_weight: float, compound_target: Literal["sample", "network"], **options: Any
+        self,
+        *,
+        v_from: Literal["boundary", "head"],
+        instant_weight: float,
+        compound_target: Literal["sample", "network"],
+        **options: Any,
     ) -> None:
         super().__init__(**options)
+        if v_from not in ("boundary", "head"):
+            raise UserError(f"generator.v_from must be boundary or head, found {v_from!r}.")
         if compound_target not in ("sample", "network"):
             raise UserError(
                 f"generator.compound_target must be sample or network, found {compound_target!r}."
             )
+        self.v_from = v_from
+        self.core_interface = "flow and v-head" if v_from == "head" else "flow"
         self.instant_weight = instant_weight
         self.compound_target = compound_target
+
+    def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
+        """v(z, t): z (B, H, A), t (B,) -> (B, H, A)."""
+        if self.v_from == "boundary":
+            return self.velocity(core, z, t, t, context)
+        return self.velocity(lambda z, t, r, context: core.instant(z, t, context), z, t, t, context)
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
@@ -51,7 +67,7 @@ class ImprovedMeanFlow(AverageVelocity):
         z, target = interpolate(x, noise, t)
         some = self.compound_rows(batch, x.device)
 
-        v = self.velocity(core, z, t, t, context)
+        v = self.instant_velocity(core, z, t, context)
         instant_error = t**self.time_power * masked_error(v - target, valid)
 
         z, r, t, context, valid = z[some], r[some], t[some], context.rows(some), valid[some]

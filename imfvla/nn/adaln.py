@@ -69,11 +69,11 @@ class AdaptiveNormCore(TransformerCore):
         """Takes the summary, the last of the context tokens (B, L, D)."""
         return Conditioning((), self.summary(context[:, -1]))
 
-    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
-        """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
+    def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+        """What the output layers read of each action token: (B, K, D)."""
         condition = F.silu(affine(self.time(t) + self.interval(t - r), None, context.summary))
         history = self.residual.begin(affine(self.patches(x), None, self.position))
         for block in self.blocks:
             block(history, condition)
         shift, scale = self.modulation(condition)
-        return self.sequence(self.output(self.norm(history.readout()) * scale + shift))
+        return self.norm(history.readout()) * scale + shift

@@ -86,10 +86,10 @@ class TransformerCore(nn.Module):
     """Maps a noisy sequence, its times and a context to a sequence: (x, t, r | context) -> (B, H, A).
 
     `residual` builds the residual from (num_sublayers, width), as the classes of `nn/residual.py` do.
-    `max_rad` is the highest frequency of the time embeddings. Raises ValueError where `patch` does not divide `steps`.
+    `max_rad` is the highest frequency of the time embeddings. `velocity_head` adds a second output layer, `instant`.
+    Raises ValueError where `patch` does not divide `steps`.
     """
 
-    interface = "flow"
     block: type[nn.Module] = Block
 
     def __init__(
@@ -104,6 +104,7 @@ class TransformerCore(nn.Module):
         mlp_ratio: float,
         max_rad: float,
         residual: Callable[[int, int], nn.Module],
+        velocity_head: bool = False,
     ) -> None:
         super().__init__()
         if steps % patch:
@@ -117,9 +118,10 @@ class TransformerCore(nn.Module):
         self.blocks = nn.ModuleList(self.block(width, heads, mlp_ratio) for _ in range(depth))
         self.residual = residual(self.block.num_sublayers * depth, width)
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
-        self.output = Linear(width, patch * channels)
-        nn.init.zeros_(self.output.weight)
-        nn.init.zeros_(self.output.bias)
+        self.output = self._output_layer()
+        if velocity_head:
+            self.velocity_output = self._output_layer()
+        self.interface = "flow and v-head" if velocity_head else "flow"
 
     def condition(self, context: Tensor) -> Conditioning:
         """Runs the context tokens (B, L, D), of which the last one is a summary, through the stack once."""
@@ -136,12 +138,26 @@ class TransformerCore(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
+        return self.sequence(self.output(self.features(x, t, r, context)))
+
+    def instant(self, x: Tensor, t: Tensor, context: Conditioning) -> Tensor:
+        """What the velocity head says at r = t (arXiv 2512.02012, appendix): x (B, H, A), t (B,) -> (B, H, A)."""
+        return self.sequence(self.velocity_output(self.features(x, t, t, context)))
+
+    def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+        """What the output layers read of each action token: (B, K, D)."""
         tokens = affine(self.patches(x), None, self.position + context.summary.unsqueeze(1))
         times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
         history = self.residual.begin(torch.cat((times, tokens), dim=1))
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
             block(history, prefix)
-        return self.sequence(self.output(self.norm(history.readout()[:, 2:])))
+        return self.norm(history.readout()[:, 2:])
+
+    def _output_layer(self) -> Linear:
+        layer = Linear(self.width, self.patch * self.channels)
+        nn.init.zeros_(layer.weight)
+        nn.init.zeros_(layer.bias)
+        return layer
 
     def patches(self, x: Tensor) -> Tensor:
         """Tokens (B, K, D) of a sequence (B, H, A)."""

@@ -16,6 +16,7 @@ def generator(**changes):
         "parametrisation": "velocity",
         "times": UniformTimes(),
         "boundary_share": 0.0,
+        "v_from": "boundary",
         "instant_weight": 0.0,
         "compound_target": "sample",
         "time_power": 0.0,
@@ -166,3 +167,33 @@ def test_high_noise_times_stay_near_one():
 def test_impossible_choices_are_refused_by_name(changes):
     with pytest.raises(UserError, match=f"generator.{next(iter(changes))}"):
         generator(**changes)
+
+
+def test_the_direction_comes_from_the_head_where_the_core_has_one():
+    """u is off by one everywhere, the head is exact."""
+
+    class TwoHeads(nn.Module):
+        flow = GaussianFlow()
+
+        def forward(self, z, t, r, context):
+            return self.flow(z, t, r, context) + 1
+
+        def instant(self, z, t, context):
+            return self.flow(z, t, t, context)
+
+    z, t, _ = draw()
+    exact, off = (
+        generator(v_from=source).instant_velocity(TwoHeads(), z, t, None) for source in ("head", "boundary")
+    )
+    torch.testing.assert_close(exact, GaussianFlow()(z, t, t, None))
+    torch.testing.assert_close(off, exact + 1)
+    assert generator(v_from="head").core_interface != generator().core_interface
+
+
+def test_half_the_adaptive_power_is_the_pseudo_huber_loss():
+    """error / sg(error + c)^(1/2) has the gradient of 2 sqrt(error + c)."""
+    error = torch.tensor([0.0, 1e-4, 0.1, 30.0], dtype=torch.float64, requires_grad=True)
+    adapted = generator(adaptive_power=0.5, adaptive_offset=1e-3).adapt(error).sum()
+    (found,) = torch.autograd.grad(adapted, error)
+    (expected,) = torch.autograd.grad(2 * (error + 1e-3).sqrt().sum(), error)
+    torch.testing.assert_close(found, expected)
