@@ -60,6 +60,7 @@ def config(**changes):
             "parametrisation": "data",
             "times": {"_target_": "imfvla.generators.base.UniformTimes"},
             "boundary_share": 0.1,
+            "v_from": "boundary",
             "instant_weight": 1.0,
             "compound_target": "sample",
             "time_power": 2.0,

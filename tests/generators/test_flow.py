@@ -101,6 +101,7 @@ def test_it_is_the_instantaneous_part_of_improved_mean_flow():
     imf = ImprovedMeanFlow(
         **OPTIONS | {"draws": 2},
         boundary_share=0.0,
+        v_from="boundary",
         instant_weight=1.0,
         compound_target="sample",
         compound_draws=1,
