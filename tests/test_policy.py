@@ -73,9 +73,9 @@ def config(**changes):
     } | changes
 
 
-def policy(statistics=STATISTICS):
+def policy(statistics=STATISTICS, **changes):
     torch.manual_seed(0)
-    made = build_policy(config(), statistics)
+    made = build_policy(config(**changes), statistics)
     torch.nn.init.normal_(made.core.output.weight, std=0.1)
     return made
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from imfvla.encoders.vision import in_unit_range
 from imfvla.instruction import NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.types import Observation
@@ -53,7 +54,7 @@ class ObservationEncoder(nn.Module):
     def forward(self, obs: Observation) -> Tensor:
         batch, steps, views = obs.images.shape[:3]
         pixels = obs.images.flatten(0, 2).contiguous(memory_format=torch.channels_last)
-        features = self.vision(pixels.float() / 127.5 - 1)
+        features = self.vision(in_unit_range(pixels))
         seen = self.view_tokens(features.unflatten(0, (batch * steps, views)))
         state = self.state(self.state_normaliser.normalise(obs.state)).flatten(0, 1).unsqueeze(1)
         tokens = torch.cat((seen, state), dim=1).unflatten(0, (batch, steps)) + self.step_identity

@@ -19,6 +19,11 @@ from imfvla.errors import UserError
 Residual = Literal["standard", "attention"]
 
 
+def in_unit_range(pixels: Tensor) -> Tensor:
+    """uint8 pixels as floats in [-1, 1], in one new array."""
+    return pixels.float().div_(127.5).sub_(1)
+
+
 def norm(channels: int) -> nn.GroupNorm:
     return nn.GroupNorm(channels // 16, channels)
 

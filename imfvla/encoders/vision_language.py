@@ -12,6 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from imfvla.encoders.vision import in_unit_range
 from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.nn.pretrained import Backbone
@@ -89,7 +90,7 @@ class VisionLanguageEncoder(Backbone, nn.Module):
     def forward(self, obs: Observation) -> Tensor:
         batch, steps, views = obs.images.shape[:3]
         pixels = obs.images.flatten(0, 2).contiguous(memory_format=torch.channels_last)
-        features = self.vision(pixels.float() / 127.5 - 1)
+        features = self.vision(in_unit_range(pixels))
         seen = self.view_tokens(features.unflatten(0, (batch * steps, views)))
         seen = (seen.unflatten(0, (batch, steps)) + self.step_identity).flatten(1, 2)
         state = self.state(self.state_normaliser.normalise(obs.state[:, -1])).unsqueeze(1)

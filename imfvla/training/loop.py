@@ -7,10 +7,8 @@ uninterrupted one bit for bit (same machine, same number of threads).
 
 import logging
 import math
-import os
-import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from typing import Any, Protocol
 
@@ -20,6 +18,7 @@ from torch import Tensor, nn
 
 from imfvla.errors import UserError
 from imfvla.fingerprint import code_version, fingerprint, physical_cores
+from imfvla.nn.compiled import compile_parts
 from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
@@ -87,7 +86,8 @@ class Trainer:
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         self.precision = precision or choose_precision(options.precision, self.device)
-        self._loss = compiled(self.policy.loss) if options.compile else self.policy.loss
+        if options.compile:
+            compile_parts(self.policy)
 
     @property
     def is_finished(self) -> bool:
@@ -147,7 +147,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         with autocast(self.precision, self.device):
-            loss, logs = self._loss(batch, torch.Generator().manual_seed(seed))
+            loss, logs = self.policy.loss(batch, torch.Generator().manual_seed(seed))
         loss_value = loss.item()
         self._refuse_non_finite("loss", loss_value)
         self.optimiser.zero_grad(set_to_none=True)
@@ -199,15 +199,6 @@ class Trainer:
 def step_seed(seed: int, step: int) -> int:
     """Seed of all random numbers that a policy draws at `step`."""
     return int(np.random.SeedSequence([seed, LOSS_STREAM, step]).generate_state(1, np.uint64)[0])
-
-
-def compiled(loss: Callable[..., Any]) -> Callable[..., Any]:
-    """`torch.compile` of a loss. Raises UserError where the C++ compiler that it needs is missing."""
-    if not any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++")):
-        raise UserError(
-            "training.compile needs a C++ compiler, none found: install g++ or set training.compile=false."
-        )
-    return torch.compile(loss)
 
 
 def choose_device(wanted: str) -> torch.device:

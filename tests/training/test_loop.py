@@ -11,9 +11,8 @@ from safetensors import safe_open
 from tiny_policy import TinyPolicy
 
 from imfvla.errors import UserError
-from imfvla.training import loop
 from imfvla.training.logger import read_metrics
-from imfvla.training.loop import choose_device, compiled, step_seed
+from imfvla.training.loop import choose_device, step_seed
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
 
@@ -193,9 +192,3 @@ def test_cuda_without_a_device_is_refused(monkeypatch):
     assert choose_device("auto").type == "cpu"
     with pytest.raises(UserError, match=r"training\.device is cuda"):
         choose_device("cuda")
-
-
-def test_compiling_without_a_compiler_is_refused(monkeypatch):
-    monkeypatch.setattr(loop.shutil, "which", lambda name: None)
-    with pytest.raises(UserError, match=r"training\.compile needs a C\+\+ compiler"):
-        compiled(lambda: None)
