@@ -30,6 +30,7 @@ EXECUTION_KEYS = (
     "demos.workers",
     "demos.directory",
     "training.threads",
+    "training.compile",
     "training.prefetch",
     "training.log_every",
     "training.save_every_s",

@@ -7,6 +7,7 @@ would drop the tangents.
 
 import os
 import shutil
+import warnings
 
 import torch
 from torch import nn
@@ -25,6 +26,7 @@ def compile_parts(policy: nn.Module, backend: str = "inductor") -> None:
         raise UserError(
             "compile=true needs a C++ compiler, none found: install g++ or leave policies uncompiled."
         )
+    warnings.filterwarnings("ignore", "`torch.jit.script_method` is deprecated")  # PyTorch's own use of it
     policy.encoder.compile(backend=backend, dynamic=False)
     policy.core.compile(backend=backend, dynamic=False)
     policy.core.condition = torch.compile(policy.core.condition, backend=backend, dynamic=False)
