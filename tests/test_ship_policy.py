@@ -45,6 +45,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
         folder / "summary.json",
         summarise([EPISODE])
         | {
+            "name": "reported",
             "experiment": "socket_ph32_exec16",
             "nfe": 1,
             "checkpoint_step": 20,
@@ -73,7 +74,14 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     assert (tmp_path / "shipped" / "metrics.jsonl").read_text().count("\n") == 3
     assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
     assert (made_by["code"], made_by["seed"]) == ("abc", 3)
-    assert made_by["results"]["nfe 1"]["success_episodes"] == 1
+    assert made_by["results"]["reported"]["success_episodes"] == 1
+
+
+def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
+    run = make_run(tmp_path / "run", size=8_000_001)
+    TOOL["ship"](run, tmp_path / "results", with_weights=False)
+    assert not list(tmp_path.glob("results/**/*.safetensors"))
+    assert (tmp_path / "results" / "rollouts" / "reported" / "episodes.jsonl").is_file()
 
 
 @pytest.mark.parametrize(

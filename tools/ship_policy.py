@@ -1,10 +1,11 @@
 """Copies what a finished run needs to be evaluated elsewhere, and what made it, into a small directory.
 
 python tools/ship_policy.py runs/socket_ph32_exec16/default experiments/pretrained/socket_ph32_exec16
+python tools/ship_policy.py --without-weights runs/socket_act/default experiments/results/socket_act/default
 
 Taken are the config, the last averaged weights, the metrics of every 10th logged step and the episodes and summaries
 of the reporting band; made_by.json says with which command, commit, seed and results. Optimiser state, recordings and
-curves stay behind.
+curves stay behind, and with --without-weights, for a result that the tables are made from, the weights too.
 """
 
 import argparse
@@ -22,7 +23,7 @@ MAX_BYTES = 8_000_000  # of the weights
 THINNING = 10
 
 
-def ship(run: RunDirectory, target: Path) -> dict[str, object]:
+def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
     """Fills `target`, which must not be there yet, and returns what made_by.json says.
 
     Raises UserError for an unfinished run, weights above 8 MB, no reported evaluation, or a target that exists.
@@ -34,13 +35,15 @@ def ship(run: RunDirectory, target: Path) -> dict[str, object]:
         raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
     weights = run.policy_weights("last")
     size = weights.stat().st_size
-    if size > MAX_BYTES:
+    if with_weights and size > MAX_BYTES:
         raise UserError(f"{weights} has {size} bytes: wanted at most {MAX_BYTES}; train a narrower core.")
     reported = [evaluation for evaluation in evaluations(run) if evaluation.is_reporting]
     if not reported:
         raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
     made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
-    shutil.copytree(weights.parent, target / weights.parent.relative_to(run.path))
+    target.mkdir(parents=True)
+    if with_weights:
+        shutil.copytree(weights.parent, target / weights.parent.relative_to(run.path))
     for name in ("config.yaml", "status.json"):
         shutil.copy2(run.path / name, target / name)
     rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -67,7 +70,7 @@ def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[
         "steps": made["step"],
         "train_s": made["train_s"],
         "machine": made["fingerprint"]["machine"],
-        "results": {f"nfe {s['nfe']}": {key: s[key] for key in shown} for s in summaries},
+        "results": {s["name"]: {key: s[key] for key in shown} for s in summaries},
     }
 
 
@@ -75,9 +78,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a finished run")
     parser.add_argument("target", type=Path, help="new directory")
+    parser.add_argument("--without-weights", action="store_true", help="results alone")
     arguments = parser.parse_args()
     try:
-        made_by = ship(RunDirectory(arguments.run), arguments.target)
+        run = RunDirectory(arguments.run)
+        made_by = ship(run, arguments.target, with_weights=not arguments.without_weights)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
