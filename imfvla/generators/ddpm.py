@@ -138,7 +138,8 @@ class DenoisingDiffusion:
             x, _ = self.estimate(core, z, k, context)
             before, now = self.kept[k - 1], self.kept[k]
             alpha = now / before
-            mean = (before**0.5 * (1 - alpha) * x + alpha**0.5 * (1 - before) * z) / (1 - now)
+            of_x = before**0.5 * (1 - alpha) / (1 - now)
+            of_z = alpha**0.5 * (1 - before) / (1 - now)
             std = ((1 - before) / (1 - now) * (1 - alpha)) ** 0.5
-            z = mean + std * later[nfe - 1 - k]
+            z = of_x * x + of_z * z + std * later[nfe - 1 - k]
         return self.estimate(core, z, 0, context)[0]

@@ -31,9 +31,9 @@ class PrefixLayer(nn.Module):
     def project(self, x: Tensor) -> tuple[Tensor, KeyValue]:
         return self.attention.project(self.attention_norm(x))
 
-    def forward(self, x: Tensor, queries: Tensor, own: KeyValue) -> Tensor:
-        """Tokens (B, L, D) behind the layer, of which `project` gave queries, keys and values."""
-        x = x + self.attention.attend(queries, own, mask=_hide_last(x))
+    def forward(self, x: Tensor, queries: Tensor, own: KeyValue, mask: Tensor) -> Tensor:
+        """Tokens (B, L, D) behind the layer, of which `project` gave queries, keys and values; mask (L, L)."""
+        x = x + self.attention.attend(queries, own, mask=mask)
         return x + self.mlp(self.mlp_norm(x))
 
 
@@ -52,14 +52,20 @@ class PrefixEnd(nn.Module):
 
 
 class JointAttention(Attention):
-    """Actions attend to the prefix and to the actions before them."""
+    """Actions attend to the prefix and to the actions before them, of `steps` in all."""
+
+    def __init__(self, width: int, heads: int, inner: int, steps: int) -> None:
+        super().__init__(width, heads, inner)
+        self.causal: Tensor
+        hidden = torch.full((steps, steps), -torch.inf).triu(1)
+        self.register_buffer("causal", hidden, persistent=False)
 
     def prepare(self, prefix: KeyValue) -> KeyValue:
         return prefix
 
     def forward(self, x: Tensor, prefix: KeyValue) -> Tensor:
         queries, own = self.project(x)
-        return self.attend(queries, own, prefix, _causal(x))
+        return self.attend(queries, own, prefix, self.causal)
 
 
 class PrefixAttention(nn.Module):
@@ -112,6 +118,7 @@ class SmolVLACore(Backbone, nn.Module):
     """
 
     interface = "flow"
+    last_token = "state"  # of the context
     key = "core"
     own = ("input.", "mlp.", "position", "time.", "interval.", "blocks.", "output.")
 
@@ -140,10 +147,14 @@ class SmolVLACore(Backbone, nn.Module):
             Linear(3 * expert_width, expert_width), nn.SiLU(), Linear(expert_width, expert_width)
         )
         self.position = nn.Parameter(0.02 * torch.randn(steps, expert_width))
-        kinds = (JointAttention, PrefixAttention)
-        self.blocks = nn.ModuleList(
-            ExpertLayer(kinds[layer % 2](expert_width, heads, width), expert_width, mlp_ratio)
+        attentions = (
+            PrefixAttention(expert_width, heads, width)
+            if layer % 2
+            else JointAttention(expert_width, heads, width, steps)
             for layer in range(depth)
+        )
+        self.blocks = nn.ModuleList(
+            ExpertLayer(attention, expert_width, mlp_ratio) for attention in attentions
         )
         self.norm = nn.LayerNorm(expert_width, elementwise_affine=False)
         self.output = Linear(expert_width, channels)
@@ -153,11 +164,11 @@ class SmolVLACore(Backbone, nn.Module):
 
     def condition(self, context: Tensor) -> Conditioning:
         """Runs the context tokens (B, L, D), of which the state is the last, through the prefix once."""
-        cached = []
+        cached, mask = [], _hide_last(context)
         for layer in self.prefix:
             queries, own = layer.project(context)
             cached.append(own)
-            context = layer(context, queries, own)
+            context = layer(context, queries, own, mask)
         cached.append(self.prefix_end.project(context))
         prepared = (block.attention.prepare(own) for block, own in zip(self.blocks, cached, strict=True))
         return Conditioning(tuple(prepared))
@@ -171,12 +182,6 @@ class SmolVLACore(Backbone, nn.Module):
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
             tokens = block(tokens, prefix)
         return self.output(self.norm(tokens))
-
-
-def _causal(x: Tensor) -> Tensor:
-    """Mask (L, L) that hides from each of the tokens (B, L, D) those behind it."""
-    hidden = torch.full((x.shape[1], x.shape[1]), -torch.inf, dtype=x.dtype, device=x.device)
-    return hidden.triu(1)
 
 
 def _hide_last(x: Tensor) -> Tensor:
