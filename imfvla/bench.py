@@ -3,117 +3,146 @@
 import json
 import logging
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 
-from imfvla.composition import compose
+from imfvla.benchmarks.tables import (
+    latency_table,
+    simulation_rows,
+    size_table,
+    speed_ratios,
+    speed_table,
+    training_rows,
+)
+from imfvla.composition import CONFIG_DIRECTORY, compose
 from imfvla.entry import entry_point
 from imfvla.fingerprint import fingerprint
 from imfvla.options import require
+from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.table import Table, number
 
+PARTS = ("sizes", "simulation", "training", "latency")
+SCALES = ("cpu", "paper")
 log = logging.getLogger(__name__)
 
 
 @entry_point("bench")
 def main(config: dict[str, Any]) -> None:
-    """Prints one table for each experiment, and all figures as one line of JSON, which comes last."""
+    """Prints the tables of the wanted parts, and all figures as one line of JSON, which comes last."""
     for key in ("training_steps", "latency_calls", "latency_warm_up"):
-        require(
-            isinstance(config[key], int) and config[key] >= 1,
-            key,
-            "a whole number of at least 1",
-            config[key],
-        )
-    figures = {}
+        value = config[key]
+        require(isinstance(value, int) and value >= 1, key, "a whole number of at least 1", value)
+    parts = config["parts"]
+    require(bool(parts) and set(parts) <= set(PARTS), "parts", f"one or more of {', '.join(PARTS)}", parts)
     GlobalHydra.instance().clear()  # the experiments are composed below
-    for experiment in config["experiments"]:
-        composed = compose("train", [f"+exp={experiment}", f"scale={config['scale']}", *config["overrides"]])
-        log.info("measuring %s at scale %s", experiment, config["scale"])
-        with tempfile.TemporaryDirectory() as scratch:
-            figures[experiment] = measure(composed, config, Path(scratch))
-        for table in tables_of(experiment, figures[experiment]):
-            table.print()
-    print(json.dumps({**config, "figures": figures, "fingerprint": fingerprint()}))
+    result: dict[str, Any] = {}
+    if "sizes" in parts:
+        result["sizes"] = sizes(experiments(config["sizes_of"], "sizes_of"), config)
+    if set(parts) != {"sizes"}:
+        result["figures"] = {
+            experiment: measure_and_print(experiment, config)
+            for experiment in experiments(config["experiments"], "experiments")
+        }
+    if "latency" in parts and not config["overrides"]:
+        latencies = {name: figures["latency"] for name, figures in result["figures"].items()}
+        result["ratios"] = speed_ratios(read_mapping().comparisons, latencies)
+        if result["ratios"]:
+            speed_table(result["ratios"]).print()
+    print(json.dumps({**config, **result, "fingerprint": fingerprint()}))
+
+
+def experiments(wanted: Any, key: str) -> list[str]:
+    """Names of files of conf/exp: those `wanted`, a list, or all of them."""
+    if wanted == "all":
+        return sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
+    require(isinstance(wanted, list) and bool(wanted), key, "all or a list of experiments", wanted)
+    return wanted
+
+
+def sizes(names: Sequence[str], config: Mapping[str, Any]) -> dict[str, Any]:
+    """Prints the table of sizes and returns its figures, by experiment and scale."""
+    from imfvla.benchmarks.sizes import measure_size  # here, since imports take seconds
+
+    found: dict[str, dict[str, Any]] = {}
+    for name in names:
+        for scale in SCALES:
+            composed = compose("train", [f"+exp={name}", f"scale={scale}"])
+            log.info("counting %s at scale %s", name, scale)
+            found.setdefault(name, {})[scale] = measure_size(composed, evaluations(composed, config))
+    size_table([(name, scale, size) for name in found for scale, size in found[name].items()]).print()
+    return found
+
+
+def evaluations(composed: Mapping[str, Any], config: Mapping[str, Any]) -> list[int]:
+    """The numbers of evaluations to measure an experiment with."""
+    return config["nfe"] or composed["evaluation"]["nfe"]
+
+
+def measure_and_print(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """All figures of an experiment but its size."""
+    composed = compose("train", [f"+exp={experiment}", f"scale={config['scale']}", *config["overrides"]])
+    log.info("measuring %s at scale %s", experiment, config["scale"])
+    with tempfile.TemporaryDirectory() as scratch:
+        figures = measure(composed, config, Path(scratch))
+    for table in tables_of(experiment, figures):
+        table.print()
+    return figures
 
 
 def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Path) -> dict[str, Any]:
-    """All figures of one experiment."""
+    """The wanted figures of one experiment."""
     import torch  # here, since imports take seconds and slips in the config are told before
 
     from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency
     from imfvla.benchmarks.simulation import make_environment, measure_demonstrations, measure_simulation
+    from imfvla.benchmarks.sizes import build_unfitted
     from imfvla.benchmarks.training import measure_training
     from imfvla.policy import build_policy
     from imfvla.training.data import prepare_windows
 
+    parts, figures = config["parts"], {}
     env = make_environment(composed)
-    simulation = measure_simulation(env)
-    demonstrating, demonstrations = measure_demonstrations(composed, scratch)
+    if "simulation" in parts:
+        figures["simulation"] = measure_simulation(env)
+    if "simulation" in parts or "training" in parts:
+        demonstrating, demonstrations = measure_demonstrations(composed, scratch)
+        figures.setdefault("simulation", {}).update(demonstrating)
     torch.manual_seed(0)
-    policy = build_policy(composed, prepare_windows(composed, demonstrations).statistics())
-    with threads(torch.get_num_threads()):
-        training = measure_training(
-            composed, policy, demonstrations, scratch / "run", config["training_steps"]
+    if "training" in parts:
+        policy = build_policy(composed, prepare_windows(composed, demonstrations).statistics())
+        with threads(torch.get_num_threads()):
+            figures["training"] = measure_training(
+                composed, policy, demonstrations, scratch / "run", config["training_steps"]
+            )
+    else:
+        policy = build_unfitted(composed)
+    if "latency" in parts:
+        figures["latency"] = measure_latency(
+            env,
+            policy.eval(),
+            evaluations(composed, config),
+            calls=config["latency_calls"],
+            warm_up=config["latency_warm_up"],
         )
-    latency = measure_latency(
-        env, policy.eval(), config["nfe"], calls=config["latency_calls"], warm_up=config["latency_warm_up"]
-    )
-    return {
-        "parameters": sum(parameter.numel() for parameter in policy.parameters()),
-        "simulation": simulation | demonstrating,
-        "training": training,
-        "latency": latency,
-    }
+    return {"parameters": sum(parameter.numel() for parameter in policy.parameters()), **figures}
 
 
 def tables_of(experiment: str, figures: Mapping[str, Any]) -> list[Table]:
     """The figures of one experiment for people."""
-    simulation, training = figures["simulation"], figures["training"]
-    speed = (
-        ("physics steps", number(simulation["physics_steps_per_s"], 0), "1/s, one process"),
-        ("control steps", number(simulation["control_steps_per_s"], 0), "1/s, one process, not rendered"),
-        ("rendered view", number(simulation["ms_per_view"], 2), "ms"),
-        ("demonstrations", number(simulation["demonstrations_per_min"], 1), "1/min, one process, recorded"),
-        ("training samples", number(training["samples_per_s"], 1), "1/s"),
-        ("training step", number(training["step_ms"], 1), f"ms, batch {training['batch_size']}"),
-        *(
-            (
-                f"  {part}",
-                number(training[f"{part}_ms"], 1),
-                f"ms, {training[f'{part}_ms'] / training['step_ms']:.0%}",
-            )
-            for part in ("data", "encoder", "core", "jvp", "backward", "optimiser")
-        ),
-        (
-            "  achieved",
-            number(training["achieved_gflops"], 1),
-            f"GFLOP/s, {training['gflop_per_step']:.1f} a step",
-        ),
-        (
-            "  peak",
-            number(training["peak_gflops"], 1),
-            f"GFLOP/s, {training['precision']} matrix product, {training['threads']} thread(s); "
-            f"achieved {training['share_of_peak']:.0%}",
-        ),
-    )
-    names = ("median_ms", "p95_ms", "encoder_ms", "core_evaluation_ms", "overhead_ms")
-    latency = tuple(
-        (name, *(number(row[key], 3) for key in names)) for name, row in figures["latency"].items()
-    )
-    parameters = f"{figures['parameters'] / 1e6:.2f} M parameters"
-    return [
-        Table(f"{experiment}, {parameters}", ("What", "Value", "Unit"), speed),
-        Table(
-            f"{experiment}: one action chunk [ms], batch 1, one thread, numpy to numpy",
-            ("sampler", "median", "p95", "encoder", "core evaluation", "overhead"),
-            latency,
-        ),
-    ]
+    speed = []
+    if "simulation" in figures:
+        speed += simulation_rows(figures["simulation"])
+    if "training" in figures:
+        speed += training_rows(figures["training"])
+    title = f"{experiment}, {number(figures['parameters'] / 1e6, 2)} M parameters"
+    tables = [Table(title, ("What", "Value", "Unit"), tuple(speed))] if speed else []
+    if "latency" in figures:
+        tables.append(latency_table(experiment, figures["latency"]))
+    return tables
 
 
 if __name__ == "__main__":

@@ -8,9 +8,12 @@ import torch
 
 from imfvla.actor import ChunkActor
 from imfvla.benchmarks.clock import threads, times_ms
+from imfvla.benchmarks.sizes import core_inputs
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.types import Observation
+
+FEWEST_CALLS = 50  # of a sampler with many evaluations
 
 
 def measure_latency(
@@ -19,7 +22,8 @@ def measure_latency(
     """Times [ms] by "infer1", ...: median and p95 of a chunk, and the medians of its parts.
 
     The parts are the encoder with its conditioning, one evaluation of the core, and the overhead: what a chunk takes
-    beyond the encoder and `nfe` evaluations. They are timed in turn with the chunk, so that all see the same machine.
+    beyond the encoder and n evaluations; `of_parts` is the chunk over that sum. They are timed in turn with the chunk,
+    so that all see the same machine, `calls` / n times, but not under 50 for its sake.
     """
     env.reset(seed=0)
     obs = policy.horizon.obs
@@ -29,10 +33,10 @@ def measure_latency(
         state=torch.from_numpy(np.stack(states)).unsqueeze(0),
         instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
     )
-    noise, one, zero = torch.randn(1, *policy.noise_shape), torch.ones(1), torch.zeros(1)
+    noise = torch.randn(1, *policy.noise_shape)
     measured = {}
     with threads(num_threads), torch.inference_mode():
-        context = policy.core.condition(policy.encoder(observation))
+        inputs = core_inputs(policy.eval(), observation, noise)
         for number in nfe:
             actor = ChunkActor(policy, policy.horizon, number, noise_seed=0)
             actor.reset(env, 0)
@@ -40,16 +44,18 @@ def measure_latency(
                 [
                     lambda actor=actor: actor.plan(images, states, 0),
                     lambda: policy.core.condition(policy.encoder(observation)),
-                    lambda: policy.core(noise, one, zero, context),
+                    lambda: policy.core(*inputs),
                 ],
-                calls,
-                warm_up,
+                min(calls, max(FEWEST_CALLS, calls // number)),
+                max(1, warm_up // number),
             )
+            parts = encoder + number * core
             measured[f"infer{number}"] = {
                 "median_ms": float(np.median(chunk)),
                 "p95_ms": float(np.percentile(chunk, 95)),
                 "encoder_ms": float(np.median(encoder)),
                 "core_evaluation_ms": float(np.median(core)),
-                "overhead_ms": float(np.median(chunk - encoder - number * core)),
+                "overhead_ms": float(np.median(chunk - parts)),
+                "of_parts": float(np.median(chunk / parts)),
             }
     return measured

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from imfvla.benchmarks.clock import times_ms
+from imfvla.benchmarks.flops import training_flops
+from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
 from imfvla.policy import Policy
 from imfvla.run_directory import RunDirectory
@@ -21,7 +22,6 @@ from imfvla.training.precision import autocast
 from imfvla.types import Batch
 
 GEMM = 2048  # rows and columns of the matrices that the peak is measured with
-PARTS = ("data", "encoder", "core", "jvp", "backward", "optimiser")
 
 
 def measure_training(
@@ -43,7 +43,7 @@ def measure_training(
     batches = make_loader(config, windows)
     try:
         batch = next(batches).to(trainer.device)
-        flops = count_flops(policy, batch, precision, trainer.device)
+        flops = training_flops(policy, batch, precision)
         spent: dict[str, float] = defaultdict(float)
         for index in range(steps + 2):
             if index == 2:  # the first steps warm up
@@ -52,7 +52,7 @@ def measure_training(
     finally:
         batches.close()
         trainer.batches.close()
-    parts = {part: 1e3 * spent[part] / steps for part in PARTS}
+    parts = {part: 1e3 * spent[part] / steps for part in PARTS_OF_A_STEP}
     step_ms = sum(parts.values())
     peak = peak_flops(precision, trainer.device)
     return {
@@ -74,16 +74,6 @@ def peak_flops(precision: str, device: torch.device) -> float:
     a = torch.randn(GEMM, GEMM, device=device, dtype=torch.bfloat16 if precision == "bf16" else torch.float32)
     taken = times_ms([lambda: (a @ a)[0, 0].item()], calls=5)
     return 2 * GEMM**3 / (1e-3 * float(taken.min()))
-
-
-def count_flops(policy: Policy, batch: Batch, precision: str, device: torch.device) -> int:
-    """Floating-point operations of the matrix products and convolutions in one loss and its gradient."""
-    with FlopCounterMode(display=False) as counter:
-        with autocast(precision, device):
-            loss, _ = policy.loss(batch, torch.Generator().manual_seed(0))
-        loss.backward()
-    policy.zero_grad(set_to_none=True)
-    return counter.get_total_flops()
 
 
 def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -> None:

@@ -1,0 +1,65 @@
+"""Parameters of a policy, and floating-point operations of a chunk and of a training sample."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from imfvla.benchmarks.flops import count_flops, training_flops
+from imfvla.instruction import MAX_WORDS
+from imfvla.policy import Policy, build_policy
+from imfvla.types import Batch, Observation
+
+
+def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any]:
+    """Counts at batch 1, of a composed config: no time is taken, weights are random.
+
+    A chunk costs the encoder with its conditioning once and `n` evaluations of the core, for each n of `nfe`.
+    """
+    policy = build_unfitted(config)
+    observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
+    encoder = count_flops(lambda: policy.core.condition(policy.encoder(observation)))
+    inputs = core_inputs(policy.eval(), observation, noise)
+    core = count_flops(lambda: policy.core(*inputs))
+    valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
+    parameters = [(p.numel(), p.requires_grad) for p in policy.parameters()]
+    return {
+        "parameters": sum(count for count, _ in parameters),
+        "trained_parameters": sum(count for count, trained in parameters if trained),
+        "encoder_gflop": encoder / 1e9,
+        "core_evaluation_gflop": core / 1e9,
+        "chunk_gflop": {f"infer{n}": (encoder + n * core) / 1e9 for n in nfe},
+        "training_gflop_per_sample": training_flops(policy, Batch(observation, noise, valid), "fp32") / 1e9,
+    }
+
+
+def build_unfitted(config: Mapping[str, Any]) -> Policy:
+    """The policy of a composed config with normalisers that change nothing, where only its costs matter."""
+    policy = build_policy(config)
+    states = torch.ones(config["state_dim"])
+    policy.encoder.fit(-states, states)
+    chunk = torch.zeros(policy.noise_shape)
+    policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
+    return policy
+
+
+def blank_observation(config: Mapping[str, Any]) -> Observation:
+    """Black pictures, zeros as the state and an empty sentence, of batch 1."""
+    steps, seen = config["horizon"]["obs"], config["observation"]
+    return Observation(
+        images=torch.zeros(1, steps, seen["num_views"], 3, *seen["image_size"], dtype=torch.uint8),
+        state=torch.zeros(1, steps, config["state_dim"]),
+        instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
+    )
+
+
+def core_inputs(policy: Policy, observation: Observation, noise: Tensor) -> tuple[Any, ...]:
+    """What the generator hands to the core in an evaluation, whatever its interface."""
+    seen: list[tuple[Any, ...]] = []
+    hook = policy.core.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
+    try:
+        policy.predict(observation, noise, 1)
+    finally:
+        hook.remove()
+    return seen[0]
