@@ -91,6 +91,7 @@ class Backbone:
     key: str
     own: tuple[str, ...]
     pretrained: str | None
+    frozen: bool
 
     def set_backbone(self, pretrained: str | None, frozen: bool) -> None:
         """Remembers the file and freezes; last in the constructor."""
@@ -99,10 +100,18 @@ class Backbone:
                 f"{self.key}.frozen=true needs {self.key}.pretrained, found null: name the safetensors file with the "
                 f"weights to keep, or train them with {self.key}.frozen=false."
             )
-        self.pretrained = pretrained
+        self.pretrained, self.frozen = pretrained, frozen
         if frozen:
             for parameter in self.backbone().values():
                 parameter.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> nn.Module:
+        """As of any module; what is frozen stays in eval mode."""
+        super().train(mode)
+        for name, module in self.named_modules():
+            if self.frozen and name and not f"{name}.".startswith(self.own):
+                module.training = False
+        return self
 
     def backbone(self) -> dict[str, nn.Parameter]:
         """The pretrained part by name."""

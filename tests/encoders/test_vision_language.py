@@ -8,7 +8,11 @@ from imfvla.encoders.vision_language import TextEncoder
 from imfvla.errors import UserError
 from imfvla.instruction import tokenize
 from imfvla.nn.pretrained import initialise_from_pretrained
+from imfvla.options import build
 from imfvla.policy import build_policy
+from imfvla.training.optimiser import make_optimiser
+from imfvla.training.options import OptimOptions
+from imfvla.types import Batch, Observation
 
 SMALL = [
     "+exp=socket_smolvla",
@@ -74,6 +78,37 @@ def test_all_but_the_state_and_the_expert_come_from_the_checkpoint_of_another_po
     } & frozen
     for name, parameter in made.named_parameters():
         assert torch.equal(parameter, (before if name in trained else other.state_dict())[name]), name
+
+
+def test_what_is_frozen_has_no_gradient_no_optimiser_state_no_decay_and_is_in_eval_mode(tmp_path):
+    file = tmp_path / "backbone.safetensors"
+    save(policy(seed=1), file)
+    made = policy(f"core.pretrained={file}", "core.frozen=true")
+    initialise_from_pretrained(made)
+    made.encoder.fit(-torch.ones(16), torch.ones(16))
+    made.chunks.normaliser.fit(torch.zeros(32, 16), torch.ones(32, 16), 1.0)
+    frozen = {name: p for name, p in made.named_parameters() if not p.requires_grad}
+    before = {name: p.clone() for name, p in frozen.items()}
+    optim = build(OptimOptions, compose("train", SMALL)["optim"] | {"lr": 0.1, "weight_decay": 0.5}, "optim")
+    optimiser = make_optimiser(made, optim)
+
+    made.train()
+    parts = (made.encoder.vision, made.encoder.text.layers, made.core.prefix[0], made.core.prefix_end)
+    assert not any(module.training for part in parts for module in part.modules())
+    assert made.core.blocks[0].training
+    assert made.encoder.state.training
+
+    obs = Observation(
+        torch.zeros(2, 1, 3, 3, 32, 32, dtype=torch.uint8), torch.rand(2, 1, 16), sentences("a", "b")
+    )
+    batch = Batch(obs, torch.rand(2, 32, 16), torch.ones(2, 32, dtype=torch.bool))
+    torch.nn.init.normal_(made.core.output.weight)
+    made.loss(batch, torch.Generator().manual_seed(0))[0].backward()
+    optimiser.step()
+    held = {id(p) for group in optimiser.param_groups for p in group["params"]}
+    assert all(p.grad is None and id(p) not in held and p not in optimiser.state for p in frozen.values())
+    assert all(torch.equal(before[name], p) for name, p in frozen.items())
+    assert made.encoder.state.weight.grad.any()  # through the frozen prefix
 
 
 def test_weights_of_another_size_are_refused_by_name(tmp_path):
