@@ -38,6 +38,11 @@ class EvaluationOptions:
     nfe: tuple[int, ...]
     workers: int | None
 
+    def __post_init__(self) -> None:
+        require(self.episodes >= 1, "evaluation.episodes", "at least 1", self.episodes)
+        require(self.first_seed >= 0, "evaluation.first_seed", "at least 0", self.first_seed)
+        require(bool(self.nfe), "evaluation.nfe", "one or more numbers of evaluations", self.nfe)
+
 
 def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     """Does what is not done yet of the experiment in `run` and prints its row.

@@ -93,6 +93,12 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
             f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
             f"core.velocity_head=true with generator.v_from=head, any other core with any other generator."
         )
+    if policy.encoder.last_token != policy.core.last_token:
+        raise UserError(
+            f"encoder {config['encoder']['_target_']} ends its context with the {policy.encoder.last_token}, core "
+            f"{config['core']['_target_']} wants the {policy.core.last_token} there: core=smolvla goes with "
+            f"encoder=smolvla/cpu or smolvla/paper, any other core with any other encoder."
+        )
     if statistics is not None:
         policy.encoder.fit(torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max))
         policy.chunks.fit(statistics)

@@ -103,13 +103,19 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("training.steps=many", r"training\.steps must be a whole number, found 'many'"),
         ("optim.lr=-1", r"optim\.lr must be above 0"),
         ("evaluation.nfe=fast", r"evaluation\.nfe must be a list"),
+        ("evaluation.nfe=[]", r"evaluation\.nfe must be one or more numbers of evaluations"),
+        ("evaluation.nfe=[1,0]", r"nfe, the number of evaluations .* at least 1, found 0"),
+        ("evaluation.episodes=0", r"evaluation\.episodes must be at least 1"),
+        ("core=block_attnres core.residual.block_size=9", r"block_size .* 8 sublayers of the core, found 9"),
+        ("generator=act core=act evaluation.nfe=[3]", r"must be 1 with generator=act .*, found 3"),
+        ("core=act", r"generator .*ImprovedMeanFlow drives .* core .*ActCore is of the kind"),
         ("generator.parametrisation=x", r"generator\.parametrisation must be data or velocity"),
         ("seed=-1", r"seed must be a whole number of at least 0"),
     ],
 )
 def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, override, message):
     with pytest.raises(UserError, match=message):
-        run_experiment(compose("train", [*TINY, override]), RunDirectory(tmp_path / "run"))
+        run_experiment(compose("train", [*TINY, *override.split()]), RunDirectory(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     assert calls == []
 

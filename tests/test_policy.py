@@ -113,6 +113,12 @@ def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
         build_policy(compose("train", groups))
 
 
+def test_an_encoder_and_a_core_that_do_not_fit_are_refused():
+    message = r"^encoder imfvla\.encoders\..* core imfvla\.nn\..* wants the .* there: core=smolvla goes with"
+    with pytest.raises(UserError, match=message):
+        build_policy(compose("train", ["core=smolvla"]))
+
+
 def test_loss_is_a_pure_function_of_batch_and_generator():
     made, data = policy(), batch()
     assert torch.equal(loss(made, data), loss(made, data))

@@ -25,6 +25,8 @@ class ObservationEncoder(nn.Module):
     comes last: the core hands it to every action token, before any attention is learnt.
     """
 
+    last_token = "summary"
+
     def __init__(
         self,
         *,

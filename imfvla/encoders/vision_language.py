@@ -55,6 +55,7 @@ class VisionLanguageEncoder(Backbone, nn.Module):
     """
 
     key = "encoder"
+    last_token = "state"
     own = ("state.", "state_normaliser.")  # what is never pretrained
 
     def __init__(

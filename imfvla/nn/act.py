@@ -19,6 +19,7 @@ class ActCore(nn.Module):
     """
 
     interface = "style"
+    last_token = "summary"  # of the context
 
     def __init__(
         self,

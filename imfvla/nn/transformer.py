@@ -91,6 +91,7 @@ class TransformerCore(nn.Module):
     """
 
     block: type[nn.Module] = Block
+    last_token = "summary"  # of the context
 
     def __init__(
         self,
