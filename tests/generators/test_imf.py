@@ -3,6 +3,8 @@
 import pytest
 import torch
 from closed_forms import MEAN, STD, STEPS, Context, GaussianFlow, Recorded, columns, draw
+from test_flow import generator as flow_generator
+from test_meanflow import generator as meanflow_generator
 from torch import nn
 
 from imfvla.errors import UserError
@@ -73,6 +75,26 @@ def test_constant_data_is_reached_in_one_step_whatever_the_noise(nfe):
 
     noise, _, _ = draw()
     sample = generator(parametrisation="data").sample(Constant(), None, noise, nfe)
+    torch.testing.assert_close(sample, MEAN.expand_as(sample), rtol=1e-5, atol=1e-5)
+
+
+class PointFlow(nn.Module):
+    """The exact average velocity of constant data, u(z, r, t) = (z - x) / t for every r."""
+
+    def forward(self, z, t, r, context):
+        return (z - MEAN) / t[:, None, None]
+
+
+@pytest.mark.parametrize("make", [generator, meanflow_generator, flow_generator])
+def test_on_constant_data_the_exact_velocity_has_no_loss_and_one_step_is_exact(make):
+    gen = make(times=LogitNormalTimes(-0.4, 1.0))
+    valid = torch.ones(64, STEPS, dtype=torch.bool)
+    loss, _ = gen.loss(
+        PointFlow(), Context(), MEAN.expand(64, -1, -1), valid, torch.Generator().manual_seed(0)
+    )
+    assert loss.max() < 1e-10
+    noise, _, _ = draw()
+    sample = gen.sample(PointFlow(), None, noise, 1)
     torch.testing.assert_close(sample, MEAN.expand_as(sample), rtol=1e-5, atol=1e-5)
 
 

@@ -33,6 +33,13 @@ def test_core_composes_and_builds(residual, conditioning, size):
     assert core(x, times, times, context).shape == x.shape
 
 
+def test_the_deep_row_has_width_384_and_18_layers_at_the_paper_s_scale():
+    config = compose("train", ["+exp=transfer_ddpm_emb384_layer18", "scale=paper"])["core"]
+    with torch.device("meta"):
+        core = instantiate(config, _convert_="all")
+    assert (core.width, len(core.blocks)) == (384, 18)
+
+
 def test_a_block_beyond_the_core_is_refused_in_one_sentence():
     config = compose("train", ["core=block_attnres", "core.residual.block_size=9"])
     with pytest.raises(

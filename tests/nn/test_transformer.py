@@ -23,7 +23,7 @@ each_core = pytest.mark.parametrize("conditioning", CORES)
 each_residual = pytest.mark.parametrize("residual", RESIDUALS)
 
 
-def make_core(residual, conditioning="token", depth=3, dtype=torch.float64):
+def make_core(residual, conditioning="token", depth=3, dtype=torch.float64, velocity_head=False):
     torch.manual_seed(0)
     core = CORES[conditioning](
         steps=8,
@@ -35,8 +35,11 @@ def make_core(residual, conditioning="token", depth=3, dtype=torch.float64):
         mlp_ratio=2.0,
         max_rad=10.0,
         residual=RESIDUALS[residual],
+        velocity_head=velocity_head,
     ).to(dtype)
     nn.init.normal_(core.output.weight, std=0.3)
+    if velocity_head:
+        nn.init.normal_(core.velocity_output.weight, std=0.3)
     if residual != "standard":
         nn.init.normal_(core.residual.query)
     return core
@@ -51,15 +54,16 @@ def inputs(batch=2, dtype=torch.float64):
 
 @each_core
 @each_residual
-def test_jacobian_vector_product_equals_central_differences(residual, conditioning):
-    core = make_core(residual, conditioning)
+@pytest.mark.parametrize("head", ["u", "v"])
+def test_jacobian_vector_product_equals_central_differences(head, residual, conditioning):
+    core = make_core(residual, conditioning, velocity_head=True)
     x, t, r, context = inputs()
     cached = core.condition(context)
     direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(2), dtype=x.dtype)
     step = 1e-5
 
     def f(x, t):
-        return core(x, t, r, cached)
+        return core(x, t, r, cached) if head == "u" else core.instant(x, t, cached)
 
     value, derivative = jvp(f, (x, t), (direction, torch.ones_like(t)))
     with torch.no_grad():
