@@ -39,7 +39,7 @@ eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or trans
 	$(PY) -m imfvla.evaluate run=$(SHIPPED) episodes=$(EPISODES) nfe=1 $(ARGS)
 	@echo "Videos, and MCAP files for Foxglove beside them:"; ls $(SHIPPED)/rollouts/*/*.mp4
 
-bench: setup  ## Measure simulation, rendering, training and latency on this machine
+bench: setup  ## Measure sizes, simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)
 
 tables: setup  ## Make the paper's tables, figures and a page from the run directories

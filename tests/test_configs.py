@@ -6,21 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 from synthetic import write_demonstrations
 
 from imfvla.composition import CONFIG_DIRECTORY, compose
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
+from imfvla.nn.residual import AttentionResidual
 from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.reporting.mapping import read_mapping
 from imfvla.run_directory import RunDirectory
+from imfvla.training.checkpoint import load_policy
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
 
 EXPERIMENTS = sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
+YES = {True: "yes", False: "no"}
 TINY = [
     "observation.image_size=[32,32]",
     "training.batch_size=2",
@@ -38,6 +42,39 @@ def demonstrations(tmp_path_factory) -> Path:
 
 def test_every_row_of_the_tables_has_its_experiment():
     assert {row.experiment for row in read_mapping().rows} <= set(EXPERIMENTS)
+
+
+def described(row) -> str:
+    """The line of docs/design.md on a row of the paper; values at scale=cpu / scale=paper where they differ."""
+    cells = []
+    for scale in ("cpu", "paper"):
+        config = compose("train", [f"+exp={row.experiment}", f"scale={scale}"])
+        with torch.device("meta"):
+            encoder = instantiate(config["encoder"], _convert_="all")
+            core = instantiate(config["core"], _convert_="all")
+        assert row.nfe in config["evaluation"]["nfe"]
+        cells.append(
+            (
+                type(encoder.vision).__name__,
+                encoder.view_tokens.tokens,
+                YES[config["encoder"]["vision"].get("residual") == "attention"],
+                type(core).__name__,
+                f"{config['core']['width']} x {config['core']['depth']}",
+                YES[isinstance(getattr(core, "residual", None), AttentionResidual)],
+                config["generator"]["_target_"].rpartition(".")[2],
+                config["horizon"]["pred"],
+                config["horizon"]["exec"],
+                config["training"]["steps"],
+                row.nfe,
+            )
+        )
+    both = (str(cpu) if cpu == paper else f"{cpu} / {paper}" for cpu, paper in zip(*cells, strict=True))
+    return f"| {row.table} | {row.label} | `{row.experiment}` | {' | '.join(both)} |"
+
+
+@pytest.mark.parametrize("row", [row for row in read_mapping().rows if row.paper], ids=lambda row: row.name)
+def test_the_reading_of_each_printed_row_is_that_of_its_config(row):
+    assert described(row) in (CONFIG_DIRECTORY.parent / "docs" / "design.md").read_text().splitlines()
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -71,6 +108,12 @@ def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, 
     after = dict(second.policy.named_parameters())
     assert all(parameter.isfinite().all() for parameter in after.values())
     assert any(not torch.equal(before[name], parameter) for name, parameter in after.items())
+
+    policy = load_policy(run)
+    obs = windows.batch(np.arange(2), np.random.default_rng(0)).obs
+    noise = torch.randn(2, *policy.noise_shape, generator=torch.Generator().manual_seed(0))
+    nfe = config["evaluation"]["nfe"][-1]
+    assert torch.equal(policy.predict(obs, noise, nfe), policy.predict(obs, noise, nfe))
 
     (summary,) = evaluate(
         run,

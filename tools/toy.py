@@ -7,6 +7,7 @@ of its derivative flipped must fail the same test. Writes toy.json, toy.svg and 
 """
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 
@@ -29,6 +30,7 @@ def main() -> int:
     parser.add_argument("--samples", type=int, default=10_000, help="that are judged")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(1)
     with Progress("eight Gaussians", len(GENERATORS) * arguments.steps) as bar:
         cases = run_cases(
