@@ -17,11 +17,11 @@ VENV := .venv
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval bench tables gallery test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations bench tables report gallery test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
-	     /^[a-z]+:.*## / {printf "  %-9s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
+	     /^[a-z-]+:.*## / {printf "  %-21s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
 	@printf '\n  ARGS="..." is handed to the command, PYTHON=python3.12 chooses the interpreter of $(VENV).\n'
 
 setup: $(INSTALLED)  ## Install into .venv, install a GL library if none renders, check the machine
@@ -39,11 +39,23 @@ eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or trans
 	$(PY) -m imfvla.evaluate run=$(SHIPPED) episodes=$(EPISODES) nfe=1 $(ARGS)
 	@echo "Videos, and MCAP files for Foxglove beside them:"; ls $(SHIPPED)/rollouts/*/*.mp4
 
+# A sweep started again skips what is finished, goes on where it was stopped and lists what failed.
+sweep-socket:  ## Train and evaluate every row of Table 1 (ARGS="seed=0,1,2")
+sweep-transfer:  ## Train and evaluate every row of Table 2
+sweep-horizon:  ## Vary predicted and executed steps
+sweep-evaluations:  ## Evaluate with 1 to 10 flow evaluations
+sweep-demonstrations:  ## Train on 25 to 200 demonstrations
+sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations: sweep-%: setup
+	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
+
 bench: setup  ## Measure sizes, simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)
 
 tables: setup  ## Make the paper's tables, figures and a page from the run directories
 	$(PY) -m imfvla.report $(ARGS)
+
+report: setup  ## The same into experiments/report, with videos and recordings: a folder to send or serve
+	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
 gallery: setup  ## Write pictures of every view of both tasks
 	$(PY) -m imfvla.gallery task=socket $(ARGS)

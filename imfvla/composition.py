@@ -36,7 +36,7 @@ def compose(config_name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
     register_resolvers()
     try:
         refuse_added_keys(config_name, overrides)
-        with initialize_config_dir(config_dir=str(_config_directory()), version_base=VERSION_BASE):
+        with initialize_config_dir(config_dir=str(config_directory()), version_base=VERSION_BASE):
             return to_plain(hydra_compose(config_name, list(overrides)))
     except (HydraException, OmegaConfBaseException) as error:
         raise explain(error, config_name, overrides) from error
@@ -55,7 +55,7 @@ def run_name(overrides: Sequence[str]) -> str:
     Sorted `key=value` pairs joined by commas, without those that only name the run (exp, name) or say how it
     executes; characters that shells or file systems dislike become "-"; long names end with a digest.
     """
-    parts = sorted({text.lstrip("+~") for text in overrides if not _is_execution_key(_key(text))})
+    parts = sorted({text.lstrip("+~") for text in overrides if not _is_execution_key(key_of(text))})
     joined = ",".join(parts)
     name = re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", re.sub(r"[\[\]\s]", "", joined)).strip("-.")
     if len(name) > MAX_RUN_NAME:
@@ -82,6 +82,11 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.removesuffix(".yaml").rpartition("/")
         options = sorted(error.options)
+        if group == "hydra/launcher":
+            return UserError(
+                f"Unknown launcher {choice!r}: known here are {', '.join(options)}; submitit_slurm and submitit_local "
+                "come with pip install -e '.[slurm]', ray with pip install -e '.[ray]'."
+            )
         return UserError(
             f"Unknown {group} {choice!r}{suggestion(choice, options)}: conf/{group} has {', '.join(options)}."
         )
@@ -102,7 +107,7 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
 
 def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserError:
     if (CONFIG_DIRECTORY / key).is_dir():
-        given = next((text for text in overrides if _key(text) == key), f"{key}=...")
+        given = next((text for text in overrides if key_of(text) == key), f"{key}=...")
         return UserError(f"{key} is chosen with a plus sign: write +{given.lstrip('+')} instead of {given}.")
     node: Any = _config_of_groups(config_name, overrides)
     parts = key.replace("/", ".").split(".")
@@ -122,10 +127,10 @@ def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserEr
 
 def _config_of_groups(config_name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """The config under those overrides alone that choose groups: its keys are the ones that exist."""
-    choices = [text for text in overrides if (CONFIG_DIRECTORY / _key(text)).is_dir()]
+    choices = [text for text in overrides if (CONFIG_DIRECTORY / key_of(text)).is_dir()]
     for trial in (choices, []):
         try:
-            with initialize_config_dir(config_dir=str(_config_directory()), version_base=VERSION_BASE):
+            with initialize_config_dir(config_dir=str(config_directory()), version_base=VERSION_BASE):
                 plain = OmegaConf.to_container(hydra_compose(config_name, trial), resolve=False)
         except (HydraException, OmegaConfBaseException):
             continue
@@ -134,7 +139,8 @@ def _config_of_groups(config_name: str, overrides: Sequence[str]) -> dict[str, A
     return {}
 
 
-def _config_directory() -> Path:
+def config_directory() -> Path:
+    """Where the YAML files are. Raises UserError where there are none."""
     if not CONFIG_DIRECTORY.is_dir():
         raise UserError(
             f"{CONFIG_DIRECTORY} is not there: configs are read from the clone, installed by pip install -e ."
@@ -142,7 +148,8 @@ def _config_directory() -> Path:
     return CONFIG_DIRECTORY
 
 
-def _key(override: str) -> str:
+def key_of(override: str) -> str:
+    """The key or group of an override as it is written on a command line."""
     return override.lstrip("+~").partition("=")[0].partition("@")[0]
 
 

@@ -1,10 +1,10 @@
 """What `python -m imfvla.<name>` has around it: Hydra, one clear line for a user's mistake, exit codes."""
 
-import logging
+import argparse
 import os
 import sys
-import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -13,22 +13,25 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
 from imfvla.errors import UserError
+from imfvla.jobs import Failure, Job
+from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
 EXIT_FAILURE, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
-log = logging.getLogger(__name__)
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[dict[str, Any]], None]], Callable[..., None]]:
+def entry_point(
+    config_name: str, is_finished: IsFinished | None = None
+) -> Callable[[Callable[[dict[str, Any]], None]], Callable[..., None]]:
     """Decorator: `function(config)` becomes a command that composes `conf/<config_name>.yaml`.
 
     The function receives the resolved config as plain dicts and lists. The command `main(argv=None)` returns
     on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C; 1
-    with a traceback after anything else. In a sweep (`-m`) all jobs run; the failures are listed at the end.
+    with a traceback after anything else. In a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run but
+    those that `is_finished(config, directory)` tells from their files; the failures are listed at the end.
     The config overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory,
     see `output_directory`, and its train.log) or both with `plain` (nothing written).
     """
@@ -37,7 +40,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[dict[str, Any]], None]]
         @wraps(function)
         def main(argv: Sequence[str] | None = None) -> None:
             arguments = list(sys.argv[1:] if argv is None else argv)
-            code = _run(function, config_name, arguments)
+            code = _run(Job(function, config_name), arguments, is_finished)
             if code:
                 sys.exit(code)
 
@@ -51,51 +54,55 @@ def output_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def _run(function: Callable[[dict[str, Any]], None], config_name: str, arguments: list[str]) -> int:
+def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
     composition.register_resolvers()
-    failures: list[tuple[str, Exception]] = []
-
-    def job(config: DictConfig) -> None:
-        task_overrides = list(HydraConfig.get().overrides.task)
-        try:
-            function(composition.to_plain(config))
-        except Exception as error:  # noted and reported below, so that the other jobs of a sweep run
-            failures.append((" ".join(task_overrides), error))
-
-    overrides = get_args_parser().parse_args(arguments).overrides
-    full_error, sys_argv = os.environ.get("HYDRA_FULL_ERROR"), sys.argv
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises instead of printing in its own way
-    sys.argv = [sys.argv[0], *arguments]
+    known = get_args_parser().parse_args(arguments)
     try:
-        composition.refuse_added_keys(config_name, overrides)
-        config_path = str(composition.CONFIG_DIRECTORY)
-        hydra.main(config_path=config_path, config_name=config_name, version_base=composition.VERSION_BASE)(
-            job
-        )()
+        with _hydra_raises(arguments):
+            composition.refuse_added_keys(job.config_name, known.overrides)
+            if _is_sweep(known):
+                failures = run_sweep(job, known.overrides, is_finished)
+            else:
+                _run_once(job)
+                failures = [job.failure] if job.failure else []
     except (HydraException, OmegaConfBaseException, UserError) as error:
-        failures.append((" ".join(overrides), error))
+        failures = [Failure.of(error, job.config_name, " ".join(known.overrides))]
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return EXIT_INTERRUPTED
+    return _report(failures)
+
+
+def _run_once(job: Job) -> None:
+    path = str(composition.CONFIG_DIRECTORY)
+    hydra.main(config_path=path, config_name=job.config_name, version_base=composition.VERSION_BASE)(job)()
+
+
+def _is_sweep(known: argparse.Namespace) -> bool:
+    shows_only = known.help or known.hydra_help or known.cfg or known.info or known.shell_completion
+    return not shows_only and (known.multirun or names_a_sweep(known.overrides))
+
+
+@contextmanager
+def _hydra_raises(arguments: Sequence[str]) -> Iterator[None]:
+    """Hydra takes these arguments and raises its errors instead of printing them in its own way."""
+    full_error, sys_argv = os.environ.get("HYDRA_FULL_ERROR"), sys.argv
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv = [sys.argv[0], *arguments]
+    try:
+        yield
     finally:
         sys.argv = sys_argv
         os.environ.pop("HYDRA_FULL_ERROR")
         if full_error is not None:
             os.environ["HYDRA_FULL_ERROR"] = full_error
-    return _report(failures, config_name)
 
 
-def _report(failures: list[tuple[str, Exception]], config_name: str) -> int:
+def _report(failures: Sequence[Failure]) -> int:
     """Prints the failures and returns the exit code."""
-    code = 0
-    for overrides, error in failures:
-        if isinstance(error, HydraException | OmegaConfBaseException):
-            error = composition.explain(error, config_name, overrides.split())
-        prefix = f"[{overrides}] " if len(failures) > 1 else ""
-        if isinstance(error, UserError):
-            print(f"{prefix}{error}", file=sys.stderr)
-            code = code or EXIT_USER_ERROR
-        else:
-            print(f"{prefix}{''.join(traceback.format_exception(error))}", end="", file=sys.stderr)
-            code = EXIT_FAILURE
-    return code
+    for failure in failures:
+        prefix = f"[{failure.overrides}] " if len(failures) > 1 else ""
+        print(f"{prefix}{failure.text}", file=sys.stderr)
+    if all(failure.is_user_error for failure in failures):
+        return EXIT_USER_ERROR if failures else 0
+    return EXIT_FAILURE

@@ -36,6 +36,9 @@ class EvaluationOptions:
     episodes: int
     first_seed: int
     nfe: tuple[int, ...]
+    checkpoint: str
+    noise_seed: int
+    device: str
     workers: int | None
 
     def __post_init__(self) -> None:

@@ -1,12 +1,16 @@
-"""python -m imfvla.train +exp=NAME: collects what is missing, trains, evaluates and prints the table row."""
+"""python -m imfvla.train +exp=NAME: collects what is missing, trains, evaluates and prints the table row.
+
+With -m, or +sweep=NAME for a file of conf/sweep: many of them, without those that are finished.
+"""
 
 from typing import Any
 
+from imfvla.completion import is_complete
 from imfvla.entry import entry_point, output_directory
 from imfvla.run_directory import RunDirectory
 
 
-@entry_point("train")
+@entry_point("train", is_complete)
 def main(config: dict[str, Any]) -> None:
     from imfvla.experiment import run_experiment  # after the config is composed: a slip is told at once
 

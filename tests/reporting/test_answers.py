@@ -160,10 +160,8 @@ def test_where_the_weights_are_there_an_evaluation_is_proposed(tmp_path):
 def test_training_evaluates_as_the_rows_want():
     evaluation = compose("train")["evaluation"]
     for row in MAPPING.rows:
-        assert (row.wanted.first_seed, row.wanted.episodes) == (
-            evaluation["first_seed"],
-            evaluation["episodes"],
-        )
+        for name in row.wanted.__slots__:
+            assert getattr(row.wanted, name) == evaluation[name]
 
 
 def test_what_stands_in_no_row_is_listed(tmp_path):

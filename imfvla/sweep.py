@@ -1,0 +1,222 @@
+"""Many jobs of one command: which there are, which have still to run, and Hydra's launcher that runs them.
+
+`-m key=1,2` gives every combination. `+sweep=NAME` gives the jobs of `conf/sweep/NAME.yaml`, each of them a list of
+overrides in Hydra's grammar or a row of the paper's tables; what else the command line says holds for all of them.
+"""
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import initialize_config_dir
+from hydra._internal.callbacks import Callbacks
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from imfvla import composition
+from imfvla.jobs import Failure, Job
+from imfvla.options import build, require
+from imfvla.progress import Progress
+from imfvla.reporting.mapping import LAST, TableRow, read_mapping
+from imfvla.reporting.paper import TABLES
+
+GROUP = "sweep"
+LOOK_EVERY_S = 5.0  # seconds between looks at what jobs in other processes have finished
+IsFinished = Callable[[dict[str, Any], Path], bool]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepOptions:
+    """A file of conf/sweep."""
+
+    table: int | None  # all rows of this table of the paper that a run answers
+    jobs: tuple[
+        tuple[str, ...], ...
+    ]  # overrides; commas and ranges in one give every combination, as with -m
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A job: its overrides, its composed config as plain dicts, and the directory that Hydra will give it."""
+
+    overrides: tuple[str, ...]
+    config: dict[str, Any]
+    directory: Path
+
+
+def names_a_sweep(overrides: Sequence[str]) -> bool:
+    """Whether there is a `+sweep=NAME` among the overrides."""
+    return any(composition.key_of(text) == GROUP for text in overrides)
+
+
+def run_sweep(job: Job, overrides: Sequence[str], is_finished: IsFinished | None) -> list[Failure]:
+    """Runs the jobs that are not finished and returns what failed; one failure stops no other job.
+
+    Args:
+      job: the task function.
+      overrides: of the command line.
+      is_finished: tells from a job's config and directory that nothing is left to do; None where nothing tells.
+
+    Raises:
+      UserError, HydraException: a job that cannot be composed, before any runs.
+    """
+    directory = str(composition.config_directory())
+    with initialize_config_dir(directory, version_base=composition.VERSION_BASE, job_name=job.config_name):
+        hydra = GlobalHydra.instance().hydra
+        common = [text for text in overrides if composition.key_of(text) != GROUP]
+        chosen = [text for text in overrides if composition.key_of(text) == GROUP]
+        master = hydra.compose_config(job.config_name, common, RunMode.MULTIRUN, with_log_configuration=True)
+        context = HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(master))
+        planned = plan(hydra.config_loader, master, chosen)
+        launcher = Plugins.instance().instantiate_launcher(context, job, master)
+        is_here = master.hydra.launcher._target_ == f"{BasicLauncher.__module__}.{BasicLauncher.__qualname__}"
+        return _Sweep(launcher, is_here, job.config_name, is_finished).run(planned)
+
+
+def plan(loader: ConfigLoader, master: DictConfig, chosen: Sequence[str]) -> list[Planned]:
+    """The jobs of `+sweep=...` under the overrides of `master`, or of these alone; none twice."""
+    parser = OverridesParser.create(config_loader=loader)
+    common = list(master.hydra.overrides.task)
+    files = [name for override in parser.parse_overrides(list(chosen)) for name in _names(override)]
+    config_name = master.hydra.job.config_name
+    lists = [job for name in files for job in _jobs_of_file(loader, config_name, name)] if files else [()]
+    products = [BasicSweeper.split_arguments(parser.parse_overrides([*own, *common]), None) for own in lists]
+    every = dict.fromkeys(tuple(job) for (product,) in products for job in product)
+    return [_planned(loader, master, job) for job in every]
+
+
+def jobs_of_rows(rows: Sequence[TableRow]) -> list[tuple[str, ...]]:
+    """For each run and its weights that rows want, the overrides that train it and evaluate it as they want it."""
+    numbers: dict[tuple[str, ...], list[int]] = {}
+    for row in rows:
+        wanted = {name: getattr(row.wanted, name) for name in row.wanted.__slots__}
+        wanted |= {"checkpoint": row.checkpoint} if row.checkpoint != LAST else {}
+        protocol = (f"evaluation.{name}={value}" for name, value in wanted.items())
+        numbers.setdefault((f"+exp={row.experiment}", *row.overrides, *protocol), []).append(row.nfe)
+    return [
+        (*job, f"evaluation.nfe=[{','.join(map(str, sorted(counts)))}]") for job, counts in numbers.items()
+    ]
+
+
+def waves(planned: Sequence[Planned]) -> list[list[Planned]]:
+    """Jobs that may run at the same time: of one run directory's, the first ones, then the second ones, and so on."""
+    number: Counter[Path] = Counter()
+    found: list[list[Planned]] = []
+    for job in planned:
+        wave = number[job.directory]
+        number[job.directory] += (
+            job.directory.name != ""
+        )  # without a directory of its own nothing can be shared
+        found += [[]] * (wave == len(found))
+        found[wave] = [*found[wave], job]
+    return found
+
+
+class _Sweep:
+    def __init__(
+        self, launcher: Launcher, is_here: bool, config_name: str, is_finished: IsFinished | None
+    ) -> None:
+        self._launcher, self._is_here = launcher, is_here
+        self._config_name, self._is_finished = config_name, is_finished
+
+    def run(self, planned: Sequence[Planned]) -> list[Failure]:
+        waiting = [job for job in planned if not self._has_finished(job)]
+        for job in planned:
+            if job not in waiting:
+                log.info("Finished already: %s", job.directory)
+        failures: list[Failure] = []
+        number = skipped = len(planned) - len(waiting)
+        with Progress("sweep", len(planned), done=skipped) as bar:
+            for batch in self._batches(waiting):
+                with self._counted(batch, bar):
+                    failures += self._launch(batch, number)
+                number += len(batch)
+        ran = len(waiting) - len(failures)
+        log.info(
+            "Jobs: %d, of which %d were finished before, %d ran and %d failed.",
+            len(planned),
+            skipped,
+            ran,
+            len(failures),
+        )
+        return failures
+
+    def _has_finished(self, job: Planned) -> bool:
+        return self._is_finished is not None and self._is_finished(job.config, job.directory)
+
+    def _batches(self, waiting: Sequence[Planned]) -> list[list[Planned]]:
+        """What the launcher gets at once; in this process job by job, so that none can end the sweep of the others."""
+        found = waves(waiting)
+        return [[job] for wave in found for job in wave] if self._is_here else found
+
+    def _launch(self, batch: Sequence[Planned], number: int) -> list[Failure]:
+        try:
+            returned = self._launcher.launch([list(job.overrides) for job in batch], initial_job_idx=number)
+            return [failure for result in returned if (failure := result.return_value) is not None]
+        except (
+            Exception
+        ) as error:  # of the launcher or of a process that died: whatever has not finished has failed
+            return [
+                Failure.of(error, self._config_name, " ".join(job.overrides))
+                for job in batch
+                if not self._has_finished(job)
+            ]
+
+    @contextmanager
+    def _counted(self, batch: Sequence[Planned], bar: Progress) -> Iterator[None]:
+        """Counts the jobs of a batch as they finish, in whatever process, and at its end those that failed too."""
+        ended, left = threading.Event(), list(batch)
+
+        def look() -> None:
+            while not ended.wait(LOOK_EVERY_S):
+                for job in [job for job in left if self._has_finished(job)]:
+                    left.remove(job)
+                    bar.advance()
+
+        watcher = threading.Thread(target=look, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            watcher.join()
+        for _ in left:
+            bar.advance()
+
+
+def _names(override: Override) -> list[str]:
+    if override.is_sweep_override():
+        return list(override.sweep_string_iterator())
+    return [override.get_value_element_as_str()]
+
+
+def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tuple[str, ...]]:
+    config = loader.load_configuration(config_name, [f"+{GROUP}={name}"], RunMode.RUN)
+    where = f"conf/{GROUP}/{name}.yaml"
+    read = build(SweepOptions, OmegaConf.to_container(config[GROUP]), where)
+    require(read.table is None or read.table in TABLES, f"{where}: table", "null, 1 or 2", read.table)
+    rows = read_mapping().of_table(read.table) if read.table else ()
+    return [*jobs_of_rows(rows), *read.jobs]
+
+
+def _planned(loader: ConfigLoader, master: DictConfig, overrides: tuple[str, ...]) -> Planned:
+    config = loader.load_sweep_config(master, list(overrides))
+    HydraConfig.instance().set_config(config)  # the name of the directory is found in it
+    directory = Path(config.hydra.sweep.dir) / config.hydra.sweep.subdir
+    plain = composition.to_plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
+    return Planned(overrides, plain, directory)

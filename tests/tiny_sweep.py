@@ -1,0 +1,90 @@
+"""`imfvla.train` on recorded episodes and in a scene without simulator: python tests/tiny_sweep.py -m seed=0,1.
+
+Every step of a training becomes a line of updates.log in the working directory; TINY_KILL_AT=N kills the process where
+step N of them all would begin.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from imfvla.completion import is_complete
+from imfvla.entry import entry_point, output_directory
+from imfvla.errors import UserError
+from imfvla.run_directory import RunDirectory
+
+OVERRIDES = [
+    "observation.image_size=[32,32]",
+    "size.width=32",
+    "size.heads=2",
+    "size.depth=1",
+    "training.batch_size=2",
+    "training.steps=2",
+    "training.checkpoints=1",
+    "training.log_every=1",
+    "training.save_every_s=0",
+    "training.threads=1",
+    "evaluation.nfe=[1]",
+    "evaluation.episodes=2",
+    "evaluation.workers=0",
+]
+UPDATES = Path("updates.log")
+
+
+def launch(arguments: list[str], directory: Path, **environment: str) -> subprocess.CompletedProcess:
+    """This command in a process of its own, in `directory`."""
+    tests = Path(__file__).resolve().parent
+    paths = os.pathsep.join([str(tests), str(tests.parent), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"} | environment
+    command = [sys.executable, __file__, *arguments]
+    return subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@entry_point("train", is_complete)
+def main(config: dict[str, Any]) -> None:
+    from imfvla import experiment
+    from imfvla.evaluation import evaluate
+
+    if config["seed"] == 13:
+        raise UserError("seed 13 is bad.")
+    update = experiment.Trainer._update
+
+    def noted(trainer: Any, batch: Any) -> dict[str, float]:
+        lines = UPDATES.read_text().splitlines() if UPDATES.exists() else []
+        if len(lines) + 1 == int(os.environ.get("TINY_KILL_AT", 0)):
+            os.kill(os.getpid(), signal.SIGKILL)
+        scalars = update(trainer, batch)
+        with UPDATES.open("a") as file:
+            file.write(f"{trainer.run.path.name} step {trainer.step}\n")
+        return scalars
+
+    with (
+        mock.patch.object(
+            experiment, "ensure_demonstrations", lambda config: Path(config["demos"]["directory"])
+        ),
+        mock.patch.object(experiment, "evaluate", partial(evaluate, build=build, recordings=False)),
+        mock.patch.object(experiment.Trainer, "_update", noted),
+    ):
+        experiment.run_experiment(config, RunDirectory(output_directory()))
+
+
+def build(run: Path, step: int) -> tuple[Any, Any]:
+    """A `workbench.Build`: the trained policy in a scene whose stages depend on time and seed."""
+    from fakes import FakeEnvironment
+
+    from imfvla.training.checkpoint import load_policy
+
+    env = FakeEnvironment()
+    env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
+    return env, load_policy(RunDirectory(run), step)
+
+
+if __name__ == "__main__":
+    main()
