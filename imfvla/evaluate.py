@@ -35,8 +35,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command. Takes `nfe=1,2,3` as a list where Hydra would take it for a sweep."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not {"-m", "--multirun"} & set(arguments):
-        arguments = [re.sub(r"^nfe=(\d+(?:,\d+)+)$", r"nfe=[\1]", text) for text in arguments]
+        arguments = nfe_as_list(arguments)
     _evaluate(arguments)
+
+
+def nfe_as_list(arguments: Sequence[str]) -> list[str]:
+    """The arguments with `nfe=1,2,3` written as Hydra writes a list."""
+    return [re.sub(r"^nfe=(\d+(?:,\d+)+)$", r"nfe=[\1]", text) for text in arguments]
 
 
 def read_nfe(value: Any) -> list[int]:

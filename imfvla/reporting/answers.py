@@ -68,7 +68,7 @@ class Sources:
             if wanted:
                 wanted.sort(key=lambda evaluation: evaluation.training_seed)
                 _check_seeds(row, wanted)
-                return Answer(row, tuple(_read(evaluation) for evaluation in wanted), "")
+                return Answer(row, tuple(read_evaluated(evaluation) for evaluation in wanted), "")
         command = self.command(row, mapping)
         if others:
             raise UserError(
@@ -103,7 +103,7 @@ class Sources:
                 identity = _identity(evaluation)
                 if evaluation.folder not in taken and identity not in answered:
                     chosen[identity] = evaluation
-        return [_read(chosen[identity]) for identity in sorted(chosen)]
+        return [read_evaluated(chosen[identity]) for identity in sorted(chosen)]
 
 
 def check_equal_protocols(answers: Sequence[Answer]) -> None:
@@ -153,7 +153,8 @@ def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
             )
 
 
-def _read(evaluation: Evaluation) -> Evaluated:
+def read_evaluated(evaluation: Evaluation) -> Evaluated:
+    """An evaluation with its episodes. Raises UserError where they are damaged or differ from the summary."""
     path = evaluation.folder / "episodes.jsonl"
     episodes = read_episodes(path, evaluation.seeds)
     for key, value in summarise(episodes).items():

@@ -1,0 +1,52 @@
+"""python -m imfvla.compare RUN_A RUN_B [nfe=2]: two runs, start by start: a verdict, a table and a picture."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from imfvla.entry import entry_point
+from imfvla.errors import UserError
+from imfvla.evaluate import nfe_as_list, read_nfe
+
+
+@entry_point("compare")
+def _compare(config: dict[str, Any]) -> None:
+    from imfvla.figures.style import render  # after the config is checked: a slip is told at once
+    from imfvla.figures.two_runs import two_runs
+    from imfvla.files import write_together
+    from imfvla.reporting.two_runs import compare_runs, table_of, verdict
+    from imfvla.run_directory import RunDirectory
+
+    if len(config["runs"]) != 2:
+        raise UserError(
+            f"compare needs two run directories, found {len(config['runs'])}: python -m imfvla.compare RUN_A RUN_B."
+        )
+    nfe = None if config["nfe"] is None else read_nfe(config["nfe"])
+    if nfe is not None and len(nfe) > 2:
+        raise UserError(f"nfe must be one number, or one of each run, found {nfe}.")
+    duels = compare_runs(*map(RunDirectory, config["runs"]), nfe)
+    table, verdicts = table_of(duels), [verdict(duel) for duel in duels]
+    text = "\n\n".join(verdicts)
+    output = Path(config["output"])
+    files = {output / "comparison.md": f"{text}\n\n{table.markdown()}".encode()}
+    files[output / "comparison.csv"] = table.csv().encode()
+    files |= {output / f"comparison{suffix}": content for suffix, content in render(two_runs(duels)).items()}
+    write_together(files)
+    table.print()
+    print(f"{text}\n")
+    for path in files:
+        print(path)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command. Takes directories as they are: `RUN_A RUN_B` for `runs=[RUN_A,RUN_B]`."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    named = [text for text in arguments if Path(text).exists() or not ("=" in text or text.startswith("-"))]
+    others = nfe_as_list([text for text in arguments if text not in named])
+    quoted = ",".join("'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'" for text in named)
+    _compare([*others, f"runs=[{quoted}]"] if named else others)
+
+
+if __name__ == "__main__":
+    main()

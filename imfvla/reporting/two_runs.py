@@ -1,0 +1,202 @@
+"""Two runs against each other, start by start: what each number of evaluations comes to, in a sentence and a table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from imfvla.errors import UserError
+from imfvla.reporting.answers import Evaluated, read_evaluated
+from imfvla.reporting.contrasts import Contrast, return_difference, speedup, success_difference
+from imfvla.reporting.pairs import Pairs, refusal
+from imfvla.reporting.power import ALPHA, POWER
+from imfvla.reporting.results import Result
+from imfvla.reporting.runs import rows
+from imfvla.reporting.significance import holm
+from imfvla.reporting.table import NOTHING, Table, interval
+from imfvla.reporting.table_row import machine
+from imfvla.reporting.tables import COLUMNS, ours, p_value
+from imfvla.run_directory import RunDirectory
+
+NAMES = ("A", "B")
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """What two policies are compared in: a column of the tables, and how a difference of it reads."""
+
+    title: str
+    column: str
+    contrast: Callable[[Pairs], Contrast]
+    scale: float
+    digits: int
+    unit: str
+    more: str  # "A {more} B by" so much
+    less: str
+    neutral: float  # of the contrast where both are alike
+
+
+MEASURES = (
+    Measure(
+        "Success", "Success-like", success_difference, 100, 1, " points",
+        more="succeeds more often than", less="succeeds less often than", neutral=0,
+    ),
+    Measure("Reward", "Avg. reward", return_difference, 1, 1, "", "earns more than", "earns less than", 0),
+    Measure("Speed", "Latency ms", speedup, 1, 2, "×", "is faster than", "is slower than", 1),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A measure of both; `contrast` is None where `refused` says why it cannot be had."""
+
+    measure: Measure
+    contrast: Contrast | None
+    p_holm: float | None = None
+    refused: str | None = None
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a difference is significant after Holm's correction over the whole table."""
+        return self.p_holm is not None and self.p_holm < ALPHA
+
+
+@dataclass(frozen=True, slots=True)
+class Duel:
+    """One evaluation of A and one of B from the same starts, and what they are compared in."""
+
+    ours: Evaluated
+    theirs: Evaluated
+    compared: tuple[Compared, ...] = ()
+
+    @property
+    def label(self) -> str:
+        one, other = self.ours.evaluation.nfe, self.theirs.evaluation.nfe
+        return f"infer{one}" if one == other else f"infer{one} against infer{other}"
+
+
+def compare_runs(a: RunDirectory, b: RunDirectory, nfe: Sequence[int] | None = None) -> list[Duel]:
+    """A against B for each number of evaluations; p-values corrected over all that is compared.
+
+    Args:
+      nfe: one number for both, or one of A and one of B; None for each number that both were evaluated with.
+
+    Raises:
+      UserError: no such evaluation, episodes that are damaged, or starts that are not the same.
+    """
+    duels = [_compare(*pair) for pair in _pairs(a, b, nfe)]
+    every = [found for duel in duels for found in duel.compared]
+    corrected = iter(holm([found.contrast.p if found.contrast else None for found in every]))
+    return [
+        replace(duel, compared=tuple(replace(found, p_holm=next(corrected)) for found in duel.compared))
+        for duel in duels
+    ]
+
+
+def verdict(duel: Duel) -> str:
+    """A sentence for each measure."""
+    sentences = [_sentence(found) for found in duel.compared]
+    return f"{duel.label}, {len(duel.ours.episodes)} pairs. " + " ".join(sentences)
+
+
+def table_of(duels: Sequence[Duel]) -> Table:
+    """Both and their difference, with p-values and what would have been found."""
+    cells = []
+    for duel in duels:
+        both = [dict(zip(COLUMNS[3:], ours(Result([e])), strict=True)) for e in (duel.ours, duel.theirs)]
+        for found in duel.compared:
+            values = (cells_of[found.measure.column] for cells_of in both)
+            cells.append((duel.label, found.measure.title, *values, *_difference(found)))
+    columns = ("nfe", "Of", *NAMES, "A against B", "p", "p (Holm)", "Test", "Detectable")
+    return Table("Two runs, start by start", columns, tuple(cells), _notes(duels[0]))
+
+
+def _compare(one: Evaluated, other: Evaluated) -> Duel:
+    reason = refusal([one], [other])
+    if reason:
+        raise UserError(f"The episodes are no pairs: {reason}. Evaluate both in the same way.")
+    timed = refusal([one], [other], times=True)
+    compared = []
+    for measure in MEASURES:
+        is_refused = measure.contrast is speedup and timed
+        contrast = None if is_refused else measure.contrast(Pairs([one], [other]))
+        compared.append(Compared(measure, contrast, refused=timed if is_refused else None))
+    return Duel(one, other, tuple(compared))
+
+
+def _pairs(a: RunDirectory, b: RunDirectory, nfe: Sequence[int] | None) -> list[tuple[Evaluated, Evaluated]]:
+    if a.path.resolve() == b.path.resolve():
+        raise UserError(f"{a.path} is given twice: wanted two runs.")
+    known = [{evaluation.nfe: evaluation for evaluation in rows(run)} for run in (a, b)]
+    numbers = [(number, number) for number in known[0] if number in known[1]]
+    if nfe is not None:
+        numbers = [(nfe[0], nfe[-1])]
+    for run, found, wanted in zip((a, b), known, zip(*numbers, strict=True), strict=False):
+        for number in wanted:
+            if number not in found:
+                raise UserError(f"{run.path} was not evaluated with nfe {number}, but with {_listed(found)}.")
+    if not numbers:
+        raise UserError(
+            f"{a.path} was evaluated with nfe {_listed(known[0])} and {b.path} with {_listed(known[1])}: no number is "
+            "common; name one of each, such as nfe=[1,100]."
+        )
+    return [(read_evaluated(known[0][one]), read_evaluated(known[1][other])) for one, other in numbers]
+
+
+def _listed(numbers: dict) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _difference(found: Compared) -> tuple[str, ...]:
+    if found.contrast is None or found.contrast.result.value is None:
+        return ("refused" if found.refused else NOTHING, NOTHING, NOTHING, NOTHING, NOTHING)
+    measure, contrast = found.measure, found.contrast
+    detectable = contrast.detectable
+    return (
+        _amount(found),
+        p_value(contrast.p),
+        p_value(found.p_holm),
+        contrast.test,
+        NOTHING if detectable is None else f"{measure.scale * detectable:.{measure.digits}f}{measure.unit}",
+    )
+
+
+def _amount(found: Compared) -> str:
+    measure, result = found.measure, found.contrast.result.scaled(found.measure.scale)
+    sign = "" if measure.neutral else "+"
+    bounds = interval(result, measure.digits)
+    return f"{result.value:{sign}.{measure.digits}f}{measure.unit} {bounds}".strip()
+
+
+def _sentence(found: Compared) -> str:
+    measure = found.measure
+    if found.refused:
+        return f"{measure.title}: not compared, as {found.refused}."
+    result = found.contrast.result
+    if result.value is None:
+        return f"{measure.title}: not measured."
+    p = f"p = {p_value(found.p_holm)}".replace("= <", "< ")
+    if not found.is_shown:
+        detectable = found.contrast.detectable
+        limit = ""
+        if detectable is not None:
+            size = f"{measure.scale * detectable:.{measure.digits}f}{measure.unit}"
+            limit = f"; {size} would have been found with probability {POWER}"
+        return f"{measure.title}: no difference shown ({_amount(found)}, {p}{limit})."
+    words = measure.more if result.value > measure.neutral else measure.less
+    return f"{measure.title}: A {words} B ({_amount(found)}, {p})."
+
+
+def _notes(duel: Duel) -> tuple[str, ...]:
+    described = []
+    for name, found in zip(NAMES, (duel.ours, duel.theirs), strict=True):
+        summary, evaluation = found.evaluation.summary, found.evaluation
+        described.append(
+            f"{name}: {evaluation.run}, weights of step {summary['checkpoint_step']}; {machine(summary)}."
+        )
+    protocol, seeds = duel.ours.evaluation.summary["protocol"], duel.ours.evaluation.seeds
+    task = f"{protocol['task']} ({protocol['variant']}), seeds {seeds[0]} to {seeds[-1]}"
+    return (
+        *described,
+        f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A less B, speed is "
+        "B's time over A's. p is two-sided, corrected by Holm over the whole table. Detectable: the least difference "
+        f"in favour of A that so many pairs would have shown with probability {POWER} at p = {ALPHA}.",
+    )
