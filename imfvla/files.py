@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -55,6 +56,14 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
         for temporary in temporaries.values():
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
+
+
+def copy_file(source: Path, path: Path) -> None:
+    """Atomic; a copy of the same size and time is left as it is. Raises UserError on a write error."""
+    original = source.stat()
+    copy = path.stat() if path.exists() else None
+    if copy is None or (copy.st_size, copy.st_mtime_ns) != (original.st_size, original.st_mtime_ns):
+        write_atomically(path, lambda temporary: shutil.copy2(source, temporary) and None)
 
 
 def write_json(path: Path, value: Any) -> None:

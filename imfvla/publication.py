@@ -15,10 +15,11 @@ from imfvla.figures.learning import learning_curves
 from imfvla.figures.overview import method_overview
 from imfvla.figures.reward_latency import reward_latency
 from imfvla.figures.style import render
-from imfvla.files import write_together
+from imfvla.files import copy_file, write_together
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import Mapping as RowMapping
+from imfvla.reporting.media import Media
 from imfvla.reporting.page import Picture, page
 from imfvla.reporting.paper import TABLES
 from imfvla.reporting.results import Result
@@ -34,15 +35,23 @@ class Publication:
 
     tables: tuple[Table, ...]
     files: dict[Path, bytes]
+    copies: dict[Path, Path]  # of files of runs that the page shows: copy -> original
 
     def write(self) -> list[Path]:
-        """All files or none. Raises UserError on a write error."""
+        """All files or none, after the copies. Raises UserError on a write error."""
+        for copy, original in self.copies.items():
+            copy_file(original, copy)
         write_together(self.files)
         return list(self.files)
 
 
 def publish(
-    directories: Sequence[Path], output: Path, mapping: RowMapping, method: Mapping[str, Any]
+    directories: Sequence[Path],
+    output: Path,
+    mapping: RowMapping,
+    method: Mapping[str, Any],
+    *,
+    media: bool = False,
 ) -> Publication:
     """What stands in the run directories, as `output` is to hold it; writes nothing.
 
@@ -51,6 +60,7 @@ def publish(
       output: directory of the files, from where the page's links lead to the runs.
       mapping: rows to runs.
       method: a composed training config, for the figures of the method.
+      media: whether videos, recordings and other files of the runs are copied beside the page, which then can be moved.
 
     Raises:
       UserError: runs are damaged, contradict each other or mix protocols; or no row of theirs is in any table.
@@ -73,12 +83,13 @@ def publish(
     figures = _figures(of_table[1], of_table[2], others, method)
     pictures = [Picture(name, caption, files[".svg"]) for name, (caption, files) in figures.items()]
     tables = tuple(document.shown for document in documents.values())
-    files = {output / "index.html": page(tables, pictures, [*results, *others], output).encode()}
+    linked = Media(output, is_copied=media)
+    files = {output / "index.html": page(tables, pictures, [*results, *others], linked).encode()}
     for stem, document in documents.items():
         files |= {output / f"{stem}{suffix}": text.encode() for suffix, text in _formats(document).items()}
     for name, (_, rendered) in figures.items():
         files |= {output / "figures" / f"{name}{suffix}": content for suffix, content in rendered.items()}
-    return Publication(tables, files)
+    return Publication(tables, files, linked.copies)
 
 
 def _formats(document: Document) -> dict[str, str]:

@@ -7,6 +7,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from imfvla.composition import compose
 from imfvla.entry import entry_point
+from imfvla.options import require
 from imfvla.run_directory import RunDirectory
 
 
@@ -25,7 +26,8 @@ def main(config: dict[str, Any]) -> None:
     directories = [Path(directory) for directory in config["directories"]]
     GlobalHydra.instance().clear()  # the method is composed below
     method = compose("train", config["method"])
-    publication = publish(directories, Path(config["output"]), mapping, method)
+    require(isinstance(config["media"], bool), "media", "true or false", config["media"])
+    publication = publish(directories, Path(config["output"]), mapping, method, media=config["media"])
     paths = publication.write()
     for table in publication.tables:
         table.print()

@@ -171,11 +171,9 @@ class _Sweep:
         except (
             Exception
         ) as error:  # of the launcher or of a process that died: whatever has not finished has failed
-            return [
-                Failure.of(error, self._config_name, " ".join(job.overrides))
-                for job in batch
-                if not self._has_finished(job)
-            ]
+            left = [" ".join(job.overrides) for job in batch if not self._has_finished(job)]
+            told = [Failure.of(error, self._config_name, overrides) for overrides in left[:1]]
+            return told + [Failure(other, "Not finished, for the same reason.", False) for other in left[1:]]
 
     @contextmanager
     def _counted(self, batch: Sequence[Planned], bar: Progress) -> Iterator[None]:

@@ -1,9 +1,12 @@
 """From run directories to all files of a report, or, where something is wrong, to one sentence and no file."""
 
+import contextlib
 import json
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from synthetic_runs import answer_row, make_run, write_evaluation
@@ -11,11 +14,14 @@ from synthetic_runs import answer_row, make_run, write_evaluation
 from imfvla import publication
 from imfvla.composition import compose
 from imfvla.errors import UserError
+from imfvla.files import write_together
 from imfvla.publication import publish
 from imfvla.reporting.mapping import PATH, read_mapping
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
+STEMS = ("table1", "table2", "table3", "others")
+EXPECTED = Path(__file__).resolve().parent / "expected_tables"
 ANSWERED = ("socket_infer1", "socket_infer2", "socket_ddpm_ph32", "transfer_infer1", "transfer_native_dp")
 
 
@@ -35,6 +41,25 @@ def runs(tmp_path: Path) -> Path:
     for index, name in enumerate(ANSWERED):
         answer_row(tmp_path / "runs", ROWS[name], quality=0.4 + 0.1 * index)
     return tmp_path / "runs"
+
+
+@pytest.fixture(scope="module")
+def tables_of_synthetic_runs(tmp_path_factory) -> dict[Path, bytes]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(tmp_path_factory.mktemp("synthetic"))
+        return make_tables()
+
+
+def make_tables() -> dict[Path, bytes]:
+    """All files but figures, of runs below the working directory that are made here and the same everywhere."""
+    for index, name in enumerate(ANSWERED):
+        answer_row(Path("runs"), ROWS[name], quality=0.4 + 0.1 * index)
+    answer_row(Path("runs"), ROWS["socket_infer2"], quality=0.55, seed=1)
+    write_evaluation(
+        make_run(Path("runs", "socket_ph32_exec16", "core=standard"), "socket_ph32_exec16"), 2, number=100
+    )
+    with mock.patch.object(publication, "_figures", return_value={}):
+        return publish([Path("runs")], Path("out"), MAPPING, {}).files
 
 
 def files(directory: Path) -> dict[str, bytes]:
@@ -63,6 +88,12 @@ def test_all_files_are_there(runs, tmp_path, method):
 def test_equal_runs_give_equal_files(runs, tmp_path, method, unrendered):
     one, other = (publish([runs], tmp_path / "out", MAPPING, method).files for _ in range(2))
     assert one == other
+
+
+@pytest.mark.parametrize("name", [f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")])
+def test_tables_are_byte_for_byte_those_on_file(name, tables_of_synthetic_runs):
+    """python tests/test_publication.py writes them anew, for a look at what has changed."""
+    assert tables_of_synthetic_runs[Path("out", name)] == (EXPECTED / name).read_bytes()
 
 
 def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrendered):
@@ -147,3 +178,10 @@ def test_the_command_needs_neither_torch_nor_a_simulator(runs, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Table 3: derived comparisons" in done.stdout
     assert str(tmp_path / "out" / "index.html") in done.stdout
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as directory, contextlib.chdir(directory):
+        for path, content in make_tables().items():
+            if path.stem in STEMS:
+                write_together({EXPECTED / path.name: content})

@@ -1,0 +1,33 @@
+"""Files of runs that a page shows or links to: where they are, or as copies beside the page."""
+
+import os
+from pathlib import Path
+from urllib.parse import quote
+
+from imfvla.errors import UserError
+
+FOLDER = "media"
+
+
+class Media:
+    """Links from a page in `directory`; with `is_copied`, `copies` says what is to be copied beside it."""
+
+    def __init__(self, directory: Path, *, is_copied: bool) -> None:
+        self._directory, self._is_copied = directory, is_copied
+        self.copies: dict[Path, Path] = {}  # copy -> original
+
+    def link(self, path: Path) -> str | None:
+        """A relative address of a file, and of a directory where nothing is copied; None where there is none."""
+        if not path.exists() or (self._is_copied and path.is_dir()):
+            return None
+        target = self._copy_of(path) if self._is_copied else path
+        return quote(Path(os.path.relpath(target, self._directory)).as_posix())
+
+    def _copy_of(self, path: Path) -> Path:
+        parts = [part for part in path.parts if part not in ("..", path.anchor)]
+        copy = self._directory / FOLDER / Path(*parts)
+        if self.copies.setdefault(copy, path).resolve() != path.resolve():
+            raise UserError(
+                f"{path} and {self.copies[copy]} would both become {copy}: rename the directory of one."
+            )
+        return copy
