@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.files import write_json
+from imfvla.files import locked, write_json
 from imfvla.fingerprint import physical_cores
 from imfvla.options import build, require
 from imfvla.progress import Progress
@@ -116,14 +116,15 @@ def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapp
     height, width = settings.image_size
     name = f"{settings.task}-{settings.variant}-modes{settings.modes}-{height}x{width}"
     directory = Path(options.directory) / name
-    log = _Log(directory, settings)
-    chosen = {seed for seed in _seeds_on_file(directory) if episode_is_complete(_path(directory, seed))}
-    workers = physical_cores() if options.workers is None else options.workers
-    num_new = _record_missing(directory, settings, options, workers, log, chosen)
-    wanted = sorted(seed for seed in chosen if seed >= options.first_seed)[: options.episodes]
-    num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in log.failed)
-    if len(wanted) < len(_seeds_on_file(directory)):
-        directory = _link_folder(directory, wanted, options)
+    with locked(directory):  # other jobs of a sweep may want the same demonstrations
+        log = _Log(directory, settings)
+        chosen = {seed for seed in _seeds_on_file(directory) if episode_is_complete(_path(directory, seed))}
+        workers = physical_cores() if options.workers is None else options.workers
+        num_new = _record_missing(directory, settings, options, workers, log, chosen)
+        wanted = sorted(seed for seed in chosen if seed >= options.first_seed)[: options.episodes]
+        num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in log.failed)
+        if len(wanted) < len(_seeds_on_file(directory)):
+            directory = _link_folder(directory, wanted, options)
     return Report(directory, len(wanted), num_new, num_failed, time.perf_counter() - began)
 
 

@@ -1,11 +1,12 @@
 """Files that are whole or absent: written beside their place, forced to disk, then renamed."""
 
 import errno
+import fcntl
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,20 @@ def copy_file(source: Path, path: Path) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Atomic, indented, keys in their order. Raises UserError on a write error."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Waits until no other process holds the lock of `path`, a hidden file beside it, and holds it.
+
+    Where none can be written nothing else can be either, and nothing is waited for.
+    """
+    with ExitStack() as held:
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            stream = held.enter_context(open(path.with_name(f".{path.name}.lock"), "w"))
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
 
 
 def sync(path: Path) -> None:

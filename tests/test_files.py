@@ -1,9 +1,11 @@
 import errno
+import threading
+from pathlib import Path
 
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.files import write_atomically, write_json, write_text, write_together
+from imfvla.files import copy_file, locked, write_atomically, write_json, write_text, write_together
 
 
 def test_replaces_whole(tmp_path):
@@ -51,3 +53,34 @@ def test_files_written_together_appear_together(tmp_path):
         write_together({one: b"changed", in_the_way: b"3"})
     assert one.read_bytes() == b"1"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "new", "one"]
+
+
+def test_a_lock_is_waited_for_and_where_none_can_be_written_not(tmp_path):
+    order = []
+
+    def wait():
+        with locked(tmp_path / "store"):
+            order.append("second")
+
+    other = threading.Thread(target=wait)
+    with locked(tmp_path / "store"):
+        other.start()
+        other.join(timeout=0.1)
+        order.append("first")
+    other.join()
+    assert order == ["first", "second"]
+    with locked(Path("/proc/nothing/store")):
+        order.append("third")
+    assert order[-1] == "third"
+
+
+def test_a_copy_is_made_where_it_differs(tmp_path):
+    source, copy = tmp_path / "source", tmp_path / "media" / "copy"
+    source.write_text("one")
+    copy_file(source, copy)
+    made = copy.stat().st_ino
+    copy_file(source, copy)
+    assert copy.stat().st_ino == made
+    source.write_text("another")
+    copy_file(source, copy)
+    assert copy.read_text() == "another"

@@ -91,7 +91,7 @@ MAY_IMPORT = {
     "recording": {"episode"},
     "reporting": {"episode", "files", "options", "run_directory"},
     "figures": {"reporting"},
-    "data": {"torch", "horizon", "instruction", "recording", "statistics", "types"},
+    "data": {"torch", "files", "horizon", "instruction", "recording", "statistics", "types"},
 }
 
 

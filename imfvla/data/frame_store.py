@@ -3,14 +3,12 @@
 Shapes: N frames, V views, H W pixels, T control steps of all episodes, S state, A action.
 """
 
-import fcntl
 import hashlib
 import json
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import cv2
 import numpy as np
 
 from imfvla.errors import UserError
+from imfvla.files import locked
 from imfvla.recording import Episode, read_episode, read_index
 
 FORMAT = 1
@@ -106,7 +105,7 @@ class FrameStore:
             )
         source = _source(files, tuple(views), tuple(image_size))
         store_path.parent.mkdir(parents=True, exist_ok=True)
-        with _lock(store_path):
+        with locked(store_path):
             if not _is_current(store_path, source):
                 _write(files, store_path, source, progress or (lambda done, total: None))
         return cls.open(store_path)
@@ -139,13 +138,6 @@ def _is_current(store_path: Path, source: dict[str, Any]) -> bool:
         return json.loads((store_path / "meta.json").read_text())["digest"] == source["digest"]
     except (OSError, ValueError, KeyError):
         return False
-
-
-@contextmanager
-def _lock(store_path: Path) -> Iterator[None]:
-    with open(store_path.with_name(f".{store_path.name}.lock"), "w") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
-        yield
 
 
 def _write(files: list[Path], store_path: Path, source: dict[str, Any], progress: Progress) -> None:
