@@ -16,7 +16,7 @@ from imfvla.reporting.metrics import untimed
 from imfvla.reporting.results import Result
 from imfvla.reporting.tables import other_table
 from imfvla.run_directory import DONE, RunDirectory
-from imfvla.sweep import Planned, jobs_of_rows, waves
+from imfvla.sweep import Planned, _Sweep, jobs_of_rows, waves
 
 MAPPING = read_mapping()
 FILES = sorted(path.stem for path in (CONFIG_DIRECTORY / "sweep").glob("*.yaml"))
@@ -164,6 +164,25 @@ def test_a_run_is_complete_with_every_evaluation_that_is_asked_for(jobs, tmp_pat
     assert not is_complete(config, tmp_path)
     next(path.rglob("summary.json")).write_text("{")
     assert not is_complete(config, path)
+
+
+def test_a_launcher_that_fails_is_told_once_and_what_has_finished_counts(tmp_path):
+    launcher = mock.Mock()
+    planned = [Planned((name,), {}, tmp_path / name) for name in ("a", "b", "c")]
+    sweep = _Sweep(launcher, False, "train", lambda config, directory: directory.exists())
+    launcher.launch.side_effect = lambda *_, **__: (tmp_path / "b").mkdir() or 1 / 0
+    failures = sweep.run(planned)
+    assert [failure.overrides for failure in failures] == ["a", "c"]
+    assert failures[0].text.endswith("ZeroDivisionError: division by zero")
+    assert failures[1].text == "Not finished, for the same reason."
+
+
+def test_an_unknown_launcher_is_told_with_where_it_comes_from(capfd):
+    with pytest.raises(SystemExit):
+        tiny_sweep.main(["-m", "seed=0,1", "hydra/launcher=submitit_slrm"])
+    printed = capfd.readouterr().err
+    assert printed.startswith("Unknown launcher 'submitit_slrm': known here are basic")
+    assert "pip install -e '.[slurm]'" in printed
 
 
 @pytest.mark.parametrize("name", ["socke", "table"])
