@@ -7,7 +7,7 @@ from typing import Any
 
 from imfvla.entry import entry_point
 from imfvla.errors import UserError
-from imfvla.evaluate import nfe_as_list, read_nfe
+from imfvla.evaluate import nfe_as_list, quoted, read_nfe
 
 
 @entry_point("compare")
@@ -44,8 +44,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if argv is None else argv)
     named = [text for text in arguments if Path(text).exists() or not ("=" in text or text.startswith("-"))]
     others = nfe_as_list([text for text in arguments if text not in named])
-    quoted = ",".join("'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'" for text in named)
-    _compare([*others, f"runs=[{quoted}]"] if named else others)
+    _compare([*others, f"runs=[{','.join(map(quoted, named))}]"] if named else others)
 
 
 if __name__ == "__main__":

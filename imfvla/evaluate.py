@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from imfvla.entry import entry_point
@@ -32,11 +33,23 @@ def _evaluate(config: dict[str, Any]) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """The command. Takes `nfe=1,2,3` as a list where Hydra would take it for a sweep."""
+    """The command. Takes `nfe=1,2,3` as a list, where Hydra would take it for a sweep, and a directory as it is."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not {"-m", "--multirun"} & set(arguments):
         arguments = nfe_as_list(arguments)
-    _evaluate(arguments)
+    _evaluate([_with_directory_quoted(text) for text in arguments])
+
+
+def _with_directory_quoted(argument: str) -> str:
+    """`run=DIR` for Hydra, where DIR is there: names of runs have `=` and `,` in them."""
+    directory = argument.removeprefix("run=")
+    is_directory = directory != argument and Path(directory).is_dir()
+    return f"run={quoted(directory)}" if is_directory else argument
+
+
+def quoted(text: str) -> str:
+    """`text` as Hydra writes a value that is to be taken as it is."""
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def nfe_as_list(arguments: Sequence[str]) -> list[str]:

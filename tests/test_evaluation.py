@@ -187,6 +187,14 @@ def test_a_wrong_command_says_what_to_do(run, tmp_path, capsys, arguments, messa
     assert not (run.path / "rollouts").exists()
 
 
+def test_a_directory_is_taken_as_it_is(run, tmp_path, capsys):
+    named = tmp_path / "it's,training.steps=3"
+    run.path.rename(named)
+    with pytest.raises(SystemExit):
+        main([f"run={named}", "checkpoint=15"])
+    assert f"{named}/checkpoints has no weights of step 15" in capsys.readouterr().err
+
+
 def test_a_run_without_weights_is_named(run):
     for path in run.checkpoints.glob("*/*"):
         path.unlink()
