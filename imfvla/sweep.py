@@ -214,7 +214,11 @@ def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tup
 
 def _planned(loader: ConfigLoader, master: DictConfig, overrides: tuple[str, ...]) -> Planned:
     config = loader.load_sweep_config(master, list(overrides))
+    before = HydraConfig.instance().cfg
     HydraConfig.instance().set_config(config)  # the name of the directory is found in it
-    directory = Path(config.hydra.sweep.dir) / config.hydra.sweep.subdir
+    try:
+        directory = Path(config.hydra.sweep.dir) / config.hydra.sweep.subdir
+    finally:
+        HydraConfig.instance().cfg = before
     plain = composition.to_plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
     return Planned(overrides, plain, directory)
