@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -9,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
 from imfvla.files import locked, write_json
 from imfvla.fingerprint import physical_cores
@@ -218,9 +220,9 @@ class _Log:
     def _read(self) -> None:
         remedy = f"choose another demos.directory, or remove {self._path.parent} to record it anew"
         try:
-            found = json.loads(self._path.read_text(encoding="utf-8"))
-            settings, self.failed = found["settings"], set(found["failed_seeds"])
-        except (ValueError, KeyError, TypeError) as error:
+            found = parse_json(read_text(self._path, MAX_JSON_BYTES))
+            settings, self.failed = dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
+        except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise UserError(f"{self._path} is damaged ({error}); {remedy}.") from error
         for key, wanted in self._settings.items():
             if settings.get(key) != wanted:
@@ -238,7 +240,8 @@ def _path(directory: Path, seed: int) -> Path:
 
 
 def _seeds_on_file(directory: Path) -> list[int]:
-    return sorted(int(path.stem.removeprefix("episode-")) for path in directory.glob("episode-*.mcap"))
+    found = (re.fullmatch(r"episode-(\d{1,9})", path.stem) for path in directory.glob("episode-*.mcap"))
+    return sorted(int(match.group(1)) for match in found if match)
 
 
 def _link_folder(directory: Path, seeds: list[int], options: DemoOptions) -> Path:

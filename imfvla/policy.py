@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from hydra.utils import instantiate
 from torch import Tensor, nn
 
 from imfvla.chunks import ChunkFrame
+from imfvla.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
@@ -71,9 +71,9 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
             horizon=horizon,
             action_dim=config["action_dim"],
             chunks=ChunkFrame(config["action_frame"], horizon.pred, config["action_dim"]),
-            encoder=instantiate(config["encoder"], _convert_="all"),
-            core=instantiate(config["core"], _convert_="all"),
-            generator=instantiate(config["generator"], _convert_="all"),
+            encoder=construct(config["encoder"], "encoder"),
+            core=construct(config["core"], "core"),
+            generator=construct(config["generator"], "generator"),
         )
     except KeyError as error:
         raise UserError(

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, write_json, write_text
 from imfvla.fingerprint import code_version
@@ -81,7 +82,7 @@ class RolloutLog:
         path = self.path / "summary.json"
         if not path.exists():
             return None
-        summary = read_json(path)
+        summary = read_json(path, "delete it and evaluate again", mapping=True)
         if summary.get("protocol") == self._protocol:
             log.info("%s is finished already; overwrite=true repeats it.", self.path)
             return summary
@@ -92,12 +93,12 @@ class RolloutLog:
         header = {"protocol": self._protocol, "code": code_version()}
         lines = []
         if self._partial.exists():
-            lines = self._partial.read_text(encoding="utf-8").splitlines(keepends=True)
+            lines = self._partial.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
         if lines and not lines[-1].endswith("\n"):  # cut off by a kill
             lines.pop()
         try:
-            found, *rows = [json.loads(line) for line in lines] or [None]
-        except json.JSONDecodeError:
+            found, *rows = [parse_json(line) for line in lines] or [None]
+        except ValueError:
             found, rows = "damaged", []
         if found == header:
             self.rows = rows
@@ -112,11 +113,3 @@ class RolloutLog:
 def dump_row(row: Row) -> str:
     """One line of JSON, keys in their order."""
     return json.dumps(row) + "\n"
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """The content of a JSON file. Raises UserError where it is broken."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path} cannot be read as JSON: {error}; delete it and evaluate again.") from error

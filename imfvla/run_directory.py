@@ -20,6 +20,7 @@ from typing import Any
 
 import yaml
 
+from imfvla.documents import read_json, read_yaml
 from imfvla.errors import UserError
 from imfvla.files import write_json, write_text
 
@@ -96,11 +97,9 @@ class RunDirectory:
         """The resolved config of the run. Raises UserError where there is none or the file is broken."""
         path = self.path / "config.yaml"
         try:
-            config = yaml.safe_load(path.read_text(encoding="utf-8"))
+            config = read_yaml(path)
         except FileNotFoundError:
             raise UserError(f"{self.path} is not a run directory: {path.name} is missing there.") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
         if not isinstance(config, dict):
             raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
         return config
@@ -129,10 +128,7 @@ class RunDirectory:
         path = self.path / "status.json"
         if not path.exists():
             return {}
-        try:
-            return json.loads(path.read_text(encoding="utf-8"))
-        except json.JSONDecodeError as error:
-            raise UserError(f"{path} cannot be read as JSON: {error}; delete it and run again.") from error
+        return read_json(path, "delete it and run again", mapping=True)
 
     def write_status(self, state: str, **details: Any) -> None:
         """state: running, done or failed; `details` (step, error, ...) replace those of before."""

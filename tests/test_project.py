@@ -86,12 +86,13 @@ MAY_IMPORT = {
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn"},
     "chunks": {"torch", "episode", "nn", "statistics"},
-    "policy": {"torch", "chunks", "generators", "horizon", "nn", "statistics", "types"},
+    "construction": {"torch"},
+    "policy": {"torch", "chunks", "construction", "generators", "horizon", "nn", "statistics", "types"},
     "tasks": {"mujoco", "dm_control", "episode", "gl"},
-    "recording": {"episode"},
-    "reporting": {"episode", "files", "options", "run_directory"},
-    "figures": {"reporting"},
-    "data": {"torch", "files", "horizon", "instruction", "recording", "statistics", "types"},
+    "recording": {"documents", "episode"},
+    "reporting": {"documents", "episode", "files", "options", "run_directory"},
+    "figures": {"documents", "reporting"},
+    "data": {"torch", "documents", "files", "horizon", "instruction", "recording", "statistics", "types"},
 }
 
 

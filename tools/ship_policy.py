@@ -14,6 +14,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.files import write_json, write_text
 from imfvla.reporting.runs import evaluations
@@ -60,7 +61,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
 def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
     """Command, commit, seed and results of a run."""
     config = run.config()
-    made = json.loads(weights.with_suffix(".json").read_text(encoding="utf-8"))
+    made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
     overrides = "" if run.path.name == "default" else " " + run.path.name.replace(",", " ")
     shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
     return {

@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.files import locked
 from imfvla.recording import Episode, read_episode, read_index
@@ -57,11 +58,11 @@ class FrameStore:
         """The store that `build` left at `path`. Raises UserError where there is none or it is damaged."""
         path = Path(path)
         try:
-            meta = json.loads((path / "meta.json").read_text())
+            meta = read_json(path / "meta.json", "delete the store", mapping=True)
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
-            image_steps = np.load(path / "image_steps.npy")
-            state, action = np.load(path / "state.npy"), np.load(path / "action.npy")
+            image_steps = _load(path / "image_steps.npy")
+            state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
             images = np.asarray(np.memmap(path / IMAGES, np.uint8, "r", shape=shape))
             episodes, row, frame = [], 0, 0
@@ -72,7 +73,7 @@ class FrameStore:
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
-        except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+        except Exception as error:  # a damaged byte can surface as anything
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it and run again."
             ) from error
@@ -135,8 +136,8 @@ def _source(files: list[Path], views: tuple[str, ...], image_size: tuple[int, in
 
 def _is_current(store_path: Path, source: dict[str, Any]) -> bool:
     try:
-        return json.loads((store_path / "meta.json").read_text())["digest"] == source["digest"]
-    except (OSError, ValueError, KeyError):
+        return read_json(store_path / "meta.json", "", mapping=True).get("digest") == source["digest"]
+    except UserError:
         return False
 
 
@@ -182,10 +183,19 @@ def _write_arrays(files: list[Path], part: Path, source: dict[str, Any], progres
             states.append(episode.state)
             actions.append(episode.action)
             progress(len(entries), len(files))
-    np.save(part / "image_steps.npy", np.concatenate(steps))
-    np.save(part / "state.npy", np.concatenate(states))
-    np.save(part / "action.npy", np.concatenate(actions))
+    _save(part / "image_steps.npy", np.concatenate(steps))
+    _save(part / "state.npy", np.concatenate(states))
+    _save(part / "action.npy", np.concatenate(actions))
     (part / "meta.json").write_text(json.dumps(source | {"episodes": entries}, indent=1))
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    np.save(path, array, allow_pickle=False)
+
+
+def _load(path: Path) -> np.ndarray:
+    """Memory-mapped first, so that a header that promises more than the file has is refused, not allocated."""
+    return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
 def _decoded(

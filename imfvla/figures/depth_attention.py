@@ -1,6 +1,5 @@
 """What the sublayers of trained policies read of earlier ones: heat maps of mean Attention Residual weights."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.figures.style import GREY, INK, new_figure, style
 
@@ -21,10 +21,12 @@ def read_depth_attention(run: Path) -> dict[str, Any] | None:
         return None
     remedy = f"delete it or repeat python tools/depth_attention.py {run}"
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path, remedy, mapping=True)
         _matrix(found["actions"])
         found["experiment"], found["checkpoint_step"]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError) as error:
         raise UserError(f"{path} holds no depth weights: {error!r}; {remedy}.") from error
     return found
 

@@ -1,8 +1,7 @@
 """Reads recorded episodes back, and refuses those that are not whole."""
 
-import json
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import pairwise
@@ -10,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
 
+from imfvla.documents import parse_json
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.recording import messages
@@ -21,6 +22,8 @@ from imfvla.recording.pictures import decode
 
 _DATA_END = struct.Struct("<BQI")  # record before the summary: opcode, length, CRC of everything before it
 _DATA_END_OPCODE = 0x0F
+MAX_CHUNK_BYTES = 256 * 2**20  # of one chunk, unpacked; ours have 1 MiB
+MAX_EPISODE_BYTES = 2 * 2**30  # of all chunks, and of all decoded pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +114,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
     rows: dict[str, list[tuple[int, bytes]]] = {}
     metadata: dict[str, dict[str, str]] = {}
     config: dict[str, Any] = {}
-    reader = StreamReader(BytesIO(data), validate_crcs=True, record_size_limit=len(data))
-    for record in reader.records:
+    for record in _records(data):
         if isinstance(record, Message):
             rows.setdefault(topics[record.channel_id], []).append((record.log_time, record.data))
         elif isinstance(record, Channel):
@@ -120,7 +122,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         elif isinstance(record, Metadata):
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment) and record.name == messages.CONFIG_ATTACHMENT:
-            config = json.loads(record.data)
+            config = parse_json(record.data)  # read, never written: its name is no path
     for name in (messages.EPISODE_RECORD, messages.RESULT_RECORD):
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
@@ -140,10 +142,10 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         raise ValueError(f"times of {messages.STATE} do not increase")
     step_at = {time: step for step, time in enumerate(times)}
 
-    states = [messages.from_arms(json.loads(text)) for _, text in rows.get(messages.STATE, [])]
-    actions = [json.loads(text) for _, text in rows.get(messages.ACTION, [])]
-    rewards = [json.loads(text) for _, text in rows.get(messages.REWARD, [])]
-    chunks = [json.loads(text) for _, text in rows.get(messages.CHUNK, [])]
+    states = [messages.from_arms(parse_json(text)) for _, text in rows.get(messages.STATE, [])]
+    actions = [parse_json(text) for _, text in rows.get(messages.ACTION, [])]
+    rewards = [parse_json(text) for _, text in rows.get(messages.REWARD, [])]
+    chunks = [parse_json(text) for _, text in rows.get(messages.CHUNK, [])]
     frames = {
         topic.removeprefix(messages.CAMERA): {step_at[time]: text for time, text in row}
         for topic, row in rows.items()
@@ -169,12 +171,46 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         chunks={chunk["step"]: _matrix(chunk["actions"]) for chunk in chunks},
         image_steps=np.array(image_steps, np.int64),
         images={
-            view: np.stack([decode(messages.camera_bytes(frames[view][step])) for step in image_steps])
+            view: np.stack(list(_decoded(frames[view][step] for step in image_steps)))
             if image_steps
             else np.zeros((0, *info.image_size, 3), np.uint8)
             for view in views
         },
     )
+
+
+def _records(data: bytes) -> Iterator[McapRecord]:
+    """The records of a file, those of chunks unpacked, checksums verified; never more than a chunk in memory.
+
+    Raises ValueError where chunks promise more than an episode can have: a small file can unpack to anything.
+    """
+    reader = StreamReader(BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
+    total = 0
+    for record in reader.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        if record.compression not in ("", "zstd"):
+            raise ValueError(f"compression {record.compression!r}, wanted zstd or none")
+        size = len(record.data)
+        if record.compression == "zstd":
+            size = zstandard.get_frame_parameters(record.data).content_size
+        total += size
+        if size > MAX_CHUNK_BYTES or total > MAX_EPISODE_BYTES:
+            raise ValueError(f"chunks that unpack to {total} bytes")
+        if size != record.uncompressed_size:
+            raise ValueError(f"a chunk of {size} bytes that is said to have {record.uncompressed_size}")
+        yield from breakup_chunk(record, validate_crc=True)
+
+
+def _decoded(encoded: Iterable[bytes]) -> Iterator[np.ndarray]:
+    total = 0
+    for message in encoded:
+        picture = decode(messages.camera_bytes(message))
+        total += picture.nbytes
+        if total > MAX_EPISODE_BYTES:
+            raise ValueError(f"pictures of more than {MAX_EPISODE_BYTES} bytes")
+        yield picture
 
 
 def _matrix(rows: list) -> np.ndarray:

@@ -7,11 +7,14 @@ it, a non-finite one as null.
 
 import base64
 import json
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from imfvla.documents import parse_json
 from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult
 
 FORMAT = "1"
@@ -30,6 +33,7 @@ LOG = "/episode/log"
 TRANSFORMS = "/tf"
 SCENE = "/scene"
 
+T = TypeVar("T")
 _ARM_AND_JOINT = tuple(tuple(name.split("/")) for name in ACTION_NAMES)
 
 
@@ -83,7 +87,7 @@ def camera_message(log_time_ns: int, view: str, encoded: bytes, image_format: st
 
 def camera_bytes(message: bytes) -> bytes:
     """The encoded picture inside a foxglove.CompressedImage."""
-    return base64.b64decode(json.loads(message)["data"], validate=True)
+    return base64.b64decode(parse_json(message)["data"], validate=True)
 
 
 def info_record(info: EpisodeInfo) -> dict[str, str]:
@@ -94,9 +98,9 @@ def info_record(info: EpisodeInfo) -> dict[str, str]:
 
 def read_info(record: dict[str, str], config: dict[str, Any]) -> EpisodeInfo:
     """Inverse of `info_record`."""
-    values = {name: json.loads(text) for name, text in record.items() if name != "format"}
+    values = {name: parse_json(text) for name, text in record.items() if name != "format"}
     values |= {"views": tuple(values["views"]), "image_size": tuple(values["image_size"])}
-    return EpisodeInfo(config=config, **values)
+    return _checked(EpisodeInfo, values | {"config": config})
 
 
 def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:
@@ -109,7 +113,27 @@ def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:
 
 def read_result(record: dict[str, str]) -> EpisodeResult:
     """Inverse of `result_record`."""
-    values = {name: json.loads(text) for name, text in record.items() if name != "recorded_steps"}
+    values = {name: parse_json(text) for name, text in record.items() if name != "recorded_steps"}
     for name in ("first_step_of_stage", "inference_ms"):
         values[name] = tuple(values[name])
-    return EpisodeResult(**values)
+    return _checked(EpisodeResult, values)
+
+
+def _checked(cls: type[T], values: dict[str, Any]) -> T:
+    """`cls(**values)`. Raises ValueError where a value is not of its field's type, which JSON does not promise."""
+    for name, hint in get_type_hints(cls).items():
+        if name in values and not _is(values[name], hint):
+            raise ValueError(f"{name} must be {hint}, found {str(values[name])[:80]}")
+    return cls(**values)
+
+
+def _is(value: Any, hint: Any) -> bool:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is UnionType:
+        return any(_is(value, argument) for argument in arguments)
+    if origin is tuple:
+        wanted = arguments[:1] * len(value) if arguments[-1] is ... else arguments
+        return len(value) == len(wanted) and all(map(_is, value, wanted))
+    if hint in (int, float):
+        return isinstance(value, int | hint) and not isinstance(value, bool)
+    return isinstance(value, NoneType if hint is None else Mapping if origin is Mapping else hint)

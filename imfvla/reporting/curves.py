@@ -1,11 +1,13 @@
 """Learning curves of a run: `metrics.jsonl`."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
+
+REMEDY = "restore or delete the file"
 
 
 def learning_curve(run: Path, metric: str = "loss") -> tuple[np.ndarray, np.ndarray]:
@@ -16,16 +18,17 @@ def learning_curve(run: Path, metric: str = "loss") -> tuple[np.ndarray, np.ndar
     path = run / "metrics.jsonl"
     if not path.exists():
         return np.empty(0), np.empty(0)
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = read_lines(path, REMEDY)
     steps, values = [], []
-    for number, line in enumerate(lines[:-1], 1):
+    for number, line in enumerate(lines, 1):
+        if not line.endswith("\n"):
+            break
         try:
-            row = json.loads(line)
-            step, value = row["step"], row.get(metric)
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(
-                f"{path}, line {number} is no row of metrics: {error}; restore or delete the file."
-            ) from error
+            row = parse_json(line)
+            step, value = float(row["step"]), row.get(metric)
+            value = value if value is None else float(value)
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise UserError(f"{path}, line {number} is no row of metrics: {error}; {REMEDY}.") from error
         if value is not None:
             steps.append(step)
             values.append(value)

@@ -1,10 +1,10 @@
 """The rows of `episodes.jsonl`, read as something that may be cut off or damaged."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
+from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
 from imfvla.reporting.metrics import TIMING, Row
 
@@ -27,14 +27,10 @@ def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
 
     Raises UserError naming file and line where one is cut off, damaged, foreign or there twice, or where some lack.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise UserError(f"{path} is missing beside its summary.json: {REMEDY}.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}; {REMEDY}.") from error
+    if not path.exists():
+        raise UserError(f"{path} is missing beside its summary.json: {REMEDY}.")
     rows: dict[int, Row] = {}
-    for number, line in enumerate(text.splitlines(keepends=True), 1):
+    for number, line in enumerate(read_lines(path, REMEDY), 1):
         where = f"{path}, line {number}"
         row = _row(line, where)
         if row["seed"] not in seeds:
@@ -57,8 +53,8 @@ def _row(line: str, where: str) -> dict[str, Any]:
     if not line.endswith("\n"):
         raise UserError(f"{where} is cut off before its end: {REMEDY}.")
     try:
-        row = json.loads(line)
-    except json.JSONDecodeError as error:
+        row = parse_json(line)
+    except ValueError as error:
         raise UserError(f"{where} is not JSON: {error}; {REMEDY}.") from error
     if not isinstance(row, dict):
         raise UserError(f"{where} must be a mapping of keys to values, found {type(row).__name__}; {REMEDY}.")

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from imfvla.documents import ChosenLoader, read_yaml
 from imfvla.errors import UserError
 from imfvla.options import build, require, suggestion
 from imfvla.reporting.paper import (
@@ -256,7 +257,7 @@ def _entries(content: dict[str, Any], key: str, path: Path) -> list[Any]:
     return content[key]
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(ChosenLoader):
     """Notes for each mapping the line where it begins, and refuses a key that is given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -273,7 +274,7 @@ _Loader.add_constructor("tag:yaml.org,2002:map", lambda loader, node: loader.con
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)  # a SafeLoader
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(path, _Loader)
+    except OSError as error:
         raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
     return _plain(content, str(path))

@@ -1,11 +1,11 @@
 """What run directories have to tell: the evaluations of a run, one for each number of flow evaluations."""
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import TableRow, read_mapping, run_key
 from imfvla.run_directory import RunDirectory, training_steps
@@ -122,13 +122,8 @@ def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError) as error:
-        raise UserError(
-            f"{path} cannot be read as JSON: {error}; evaluate again with overwrite=true."
-        ) from error
+    summary = read_json(path, "evaluate again with overwrite=true", mapping=True)
+    missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
     if missing:
         raise UserError(f"{path} lacks {', '.join(missing)}: evaluate again with overwrite=true.")
     return Evaluation(run.path, folder, summary, config)

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from imfvla.documents import parse_json
 from imfvla.errors import UserError
 from imfvla.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.policy import Policy, build_policy
@@ -25,6 +26,14 @@ from imfvla.run_directory import RunDirectory
 STATE_FORMAT = "imfvla-state-1"
 WEIGHTS_FORMAT = "imfvla-policy-1"
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
+# What the loop goes on from beside the tensors, and its types.
+DETAILS = {
+    "step": (int,),
+    "train_s": (int, float),
+    "precision": (str,),
+    "batches": (dict,),
+    "logger": (dict,),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +63,7 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
         raise UserError(
             f"{path} is not a training state: wanted format {STATE_FORMAT}, found {header.get('format')!r}."
         )
+    details = _read_details(path, header)
     wanted = {f"policy/{name}": tensor for name, tensor in state.policy.state_dict().items()}
     wanted |= {f"averaged/{name}": tensor for name, tensor in state.averaged.state_dict().items()}
     moments = {
@@ -76,7 +86,7 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
                         for moment in MOMENTS[1:]
                     },
                 }
-    return json.loads(header["details"])
+    return details
 
 
 def save_weights(directory: Path, policy: nn.Module, description: Mapping[str, Any]) -> None:
@@ -133,10 +143,24 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
-    except (SafetensorError, OSError) as error:
+    except Exception as error:  # a damaged header can surface as anything, from SafetensorError to KeyError
         raise UserError(
             f"{path} is cut off or damaged ({error}): restore it, or delete it and train again."
         ) from error
+
+
+def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
+    """What `save_state` was given beside the tensors. Raises UserError where it is not what the loop saves."""
+    try:
+        details = parse_json(header["details"])
+        kinds = {key: type(details[key]) for key in DETAILS}
+        if any(kinds[key] not in DETAILS[key] for key in DETAILS) or details["step"] < 0:
+            raise ValueError(f"wanted {DETAILS}, found {kinds}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} has a damaged header ({error!r}): restore it, or delete it and train again."
+        ) from error
+    return details
 
 
 def _refuse_misfits(path: Path, wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, write_text
 from imfvla.run_directory import RunDirectory
@@ -59,14 +60,17 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     rows = []
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = read_lines(path, "restore or delete the file")
     for number, line in enumerate(lines, 1):
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError as error:
+            row = parse_json(line)
+            if not isinstance(row, dict) or not isinstance(row.get("step"), int):
+                raise ValueError("wanted a mapping with a step")
+            rows.append(row)
+        except ValueError as error:
             if number < len(lines):
                 raise UserError(
-                    f"{path}, line {number} is not JSON: {error}; restore or delete the file."
+                    f"{path}, line {number} is not JSON of a row: {error}; restore or delete the file."
                 ) from error
     return rows
 

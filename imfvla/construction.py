@@ -1,0 +1,82 @@
+"""Builds what a config's `_target_` names, from a short list of places: a stranger's config must not run code."""
+
+import importlib
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from hydra.utils import instantiate
+from torch.optim import Optimizer
+
+from imfvla.errors import UserError
+
+# Whose classes a config may name. Constructors there compute; none writes a file, starts a process or evaluates text.
+PACKAGES = ("imfvla.encoders", "imfvla.generators", "imfvla.nn")
+OPTIMISERS = "torch.optim"
+# `_args_` and `_recursive_` would change how a part is built from what its constructor says.
+SPECIAL_KEYS = ("_target_", "_partial_")
+MAX_DEPTH = 32
+
+
+def construct(part: Mapping[str, Any], key: str) -> Any:
+    """The object that `part`, a resolved config under `key`, describes; nested parts are built first.
+
+    Raises UserError, before anything is built, where a `_target_` is no class of `PACKAGES` and no optimiser of
+    torch, or where a text is an interpolation, which would read the environment. What a constructor raises passes
+    wrapped by Hydra.
+    """
+    if not isinstance(part, Mapping) or "_target_" not in part:
+        raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
+    for where, value in _leaves(part, key, 0):
+        name = where.rpartition(".")[2]
+        if name == "_target_":
+            refuse_foreign_target(value, where)
+        elif re.fullmatch(r"_\w+_", name) and name not in SPECIAL_KEYS:
+            raise UserError(
+                f"{where} is not allowed: of Hydra's own keys there are {', '.join(SPECIAL_KEYS)}."
+            )
+        elif isinstance(value, str) and "${" in value:
+            raise UserError(f"{where} must be a plain value, found the interpolation {value!r}.")
+    return instantiate(dict(part), _convert_="all")
+
+
+def refuse_foreign_target(target: Any, key: str) -> None:
+    """Raises UserError unless `target` is the full name of a class that a config may have built.
+
+    A prefix is not enough: `imfvla.files.os.system` begins like one of ours and is `os.system`.
+    """
+    if not (isinstance(target, str) and _is_ours(target)):
+        raise UserError(
+            f"{key} must name a class defined in {', '.join(PACKAGES)}, or an optimiser of {OPTIMISERS}, "
+            f"found {target!r}: a config from somewhere else must not choose what is run."
+        )
+
+
+def _is_ours(target: str) -> bool:
+    module_name, _, name = target.rpartition(".")
+    if not re.fullmatch(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+", target):
+        return False
+    if module_name == OPTIMISERS:
+        found = getattr(importlib.import_module(OPTIMISERS), name, None)
+        return inspect.isclass(found) and issubclass(found, Optimizer)
+    if not any(module_name == package or module_name.startswith(f"{package}.") for package in PACKAGES):
+        return False
+    try:
+        found = getattr(importlib.import_module(module_name), name, None)
+    except ImportError:
+        return False
+    return inspect.isclass(found) and found.__module__ == module_name
+
+
+def _leaves(value: Any, key: str, depth: int) -> Iterator[tuple[str, Any]]:
+    if depth > MAX_DEPTH:
+        raise UserError(f"{key[:80]}... is nested deeper than {MAX_DEPTH} levels.")
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _leaves(item, f"{key}.{name}", depth + 1)
+    elif isinstance(value, list | tuple):
+        for number, item in enumerate(value):
+            yield from _leaves(item, f"{key}[{number}]", depth + 1)
+    else:
+        yield key, value
