@@ -3,7 +3,7 @@
 import importlib
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from hydra.utils import instantiate
@@ -28,16 +28,7 @@ def construct(part: Mapping[str, Any], key: str) -> Any:
     """
     if not isinstance(part, Mapping) or "_target_" not in part:
         raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
-    for where, value in _leaves(part, key, 0):
-        name = where.rpartition(".")[2]
-        if name == "_target_":
-            refuse_foreign_target(value, where)
-        elif re.fullmatch(r"_\w+_", name) and name not in SPECIAL_KEYS:
-            raise UserError(
-                f"{where} is not allowed: of Hydra's own keys there are {', '.join(SPECIAL_KEYS)}."
-            )
-        elif isinstance(value, str) and "${" in value:
-            raise UserError(f"{where} must be a plain value, found the interpolation {value!r}.")
+    _refuse_foreign(part, key, 0)
     return instantiate(dict(part), _convert_="all")
 
 
@@ -69,14 +60,22 @@ def _is_ours(target: str) -> bool:
     return inspect.isclass(found) and found.__module__ == module_name
 
 
-def _leaves(value: Any, key: str, depth: int) -> Iterator[tuple[str, Any]]:
+def _refuse_foreign(value: Any, key: str, depth: int) -> None:
     if depth > MAX_DEPTH:
         raise UserError(f"{key[:80]}... is nested deeper than {MAX_DEPTH} levels.")
     if isinstance(value, Mapping):
         for name, item in value.items():
-            yield from _leaves(item, f"{key}.{name}", depth + 1)
+            where = f"{key}.{name}"
+            if name == "_target_":
+                refuse_foreign_target(item, where)
+            elif re.fullmatch(r"_\w+_", str(name)) and name not in SPECIAL_KEYS:
+                raise UserError(
+                    f"{where} is not allowed: of Hydra's own keys there are {', '.join(SPECIAL_KEYS)}."
+                )
+            else:
+                _refuse_foreign(item, where, depth + 1)
     elif isinstance(value, list | tuple):
         for number, item in enumerate(value):
-            yield from _leaves(item, f"{key}[{number}]", depth + 1)
-    else:
-        yield key, value
+            _refuse_foreign(item, f"{key}[{number}]", depth + 1)
+    elif isinstance(value, str) and "${" in value:
+        raise UserError(f"{key} must be a plain value, found the interpolation {value!r}.")

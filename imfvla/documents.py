@@ -1,6 +1,8 @@
 """JSON and YAML files that others may have written or damaged: a value or a UserError, in bounded time and memory."""
 
 import json
+import re
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,12 @@ import yaml
 from imfvla.errors import UserError
 
 MAX_JSON_BYTES = 64 * 2**20
+MAX_YAML_DEPTH = 64
 MAX_YAML_BYTES = 256 * 2**10  # read a hundred times more slowly than JSON; a config has some 4 kB
 
 
 class ChosenLoader(yaml.SafeLoader):
-    """Safe, and without aliases: nine lines of them unfold to billions of values."""
+    """Safe, and without aliases, nine lines of which unfold to billions of values."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -35,11 +38,20 @@ def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
 def read_yaml(path: Path, loader: type[yaml.SafeLoader] = ChosenLoader) -> Any:
     """The value in `path`. Raises FileNotFoundError where it is missing, UserError where it cannot be read."""
     try:
-        return yaml.load(read_text(path, MAX_YAML_BYTES), Loader=loader)  # a SafeLoader
+        text = read_text(path, MAX_YAML_BYTES)
+        if _bracket_depth(text) > MAX_YAML_DEPTH:
+            raise ValueError(f"it is nested deeper than {MAX_YAML_DEPTH} levels")
+        return yaml.load(text, Loader=loader)  # a SafeLoader
     except FileNotFoundError:
         raise
     except Exception as error:  # a date that does not exist or a deep nesting surface as anything
         raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
+
+
+def _bracket_depth(text: str) -> int:
+    """The time to read nested brackets grows with the square of their depth, so it is found out before."""
+    changes = (1 if match.group() in "[{" else -1 for match in re.finditer(r"[\[\]{}]", text))
+    return max(accumulate(changes), default=0)
 
 
 def read_text(path: Path, limit: int) -> str:

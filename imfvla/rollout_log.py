@@ -14,6 +14,7 @@ from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, write_json, write_text
 from imfvla.fingerprint import code_version
+from imfvla.reporting.episodes import read_row
 from imfvla.reporting.metrics import Row
 
 log = logging.getLogger(__name__)
@@ -97,8 +98,9 @@ class RolloutLog:
         if lines and not lines[-1].endswith("\n"):  # cut off by a kill
             lines.pop()
         try:
-            found, *rows = [parse_json(line) for line in lines] or [None]
-        except ValueError:
+            found = parse_json(lines[0]) if lines else None
+            rows = [read_row(line, PARTIAL) for line in lines[1:]]
+        except (ValueError, UserError):
             found, rows = "damaged", []
         if found == header:
             self.rows = rows

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -49,7 +48,7 @@ def read_weights(path: str | Path, key: str) -> dict[str, Tensor]:
         raise UserError(
             f"{key} names {path}, which is not there: correct the path, or take null to begin with random weights."
         ) from None
-    except (SafetensorError, OSError) as error:
+    except Exception as error:  # a damaged header can surface as anything, from SafetensorError to KeyError
         raise UserError(
             f"{key} names {path}, which cannot be read as safetensors ({error}): restore the file."
         ) from error

@@ -215,7 +215,9 @@ def _decoded(encoded: Iterable[bytes]) -> Iterator[np.ndarray]:
 
 def _matrix(rows: list) -> np.ndarray:
     """float32 (len(rows), 16); None becomes NaN."""
-    return np.array(rows, np.float64).astype(np.float32).reshape(len(rows), len(messages.ACTION_NAMES))
+    with np.errstate(over="ignore"):  # what is too large for a float32 is infinite
+        numbers = np.array(rows, np.float64).astype(np.float32)
+    return numbers.reshape(len(rows), len(messages.ACTION_NAMES))
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -32,7 +32,7 @@ def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
     rows: dict[int, Row] = {}
     for number, line in enumerate(read_lines(path, REMEDY), 1):
         where = f"{path}, line {number}"
-        row = _row(line, where)
+        row = read_row(line, where)
         if row["seed"] not in seeds:
             raise UserError(
                 f"{where} is of seed {row['seed']}, its summary.json of {seeds[0]} to {seeds[-1]}: {REMEDY}."
@@ -49,7 +49,8 @@ def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
     return tuple(rows[seed] for seed in seeds)
 
 
-def _row(line: str, where: str) -> dict[str, Any]:
+def read_row(line: str, where: str) -> dict[str, Any]:
+    """The row that `line` has. Raises UserError, beginning with `where`, for anything else."""
     if not line.endswith("\n"):
         raise UserError(f"{where} is cut off before its end: {REMEDY}.")
     try:

@@ -11,12 +11,15 @@ from imfvla.reporting.mapping import TableRow, read_mapping, run_key
 from imfvla.run_directory import RunDirectory, training_steps
 
 REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are demonstrations and selection
+REMEDY = ": evaluate again with overwrite=true"
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
     "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
     "inference_ms_p95", "success_interval", "failures",
 )  # fmt: skip
-DESCRIPTION = ("experiment", "nfe", "checkpoint_step", "seeds", "protocol", "fingerprint")
+DESCRIPTION = {
+    "experiment": str, "nfe": int, "checkpoint_step": int, "seeds": list, "protocol": dict, "fingerprint": dict,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +125,14 @@ def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    summary = read_json(path, "evaluate again with overwrite=true", mapping=True)
+    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
     missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
     if missing:
-        raise UserError(f"{path} lacks {', '.join(missing)}: evaluate again with overwrite=true.")
+        raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")
+    for key, kind in DESCRIPTION.items():
+        if not isinstance(summary[key], kind):
+            raise UserError(f"{path}: {key} must be of type {kind.__name__}, found {summary[key]!r}{REMEDY}.")
+    seeds = summary["seeds"]
+    if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
+        raise UserError(f"{path}: seeds must be the first and the last one, found {seeds!r}{REMEDY}.")
     return Evaluation(run.path, folder, summary, config)

@@ -1,0 +1,218 @@
+"""Files and configs from strangers: only a UserError comes out, nothing of theirs is run, nothing leaves its place."""
+
+import ast
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic import write_episode
+
+from imfvla.composition import compose, run_name
+from imfvla.construction import construct, refuse_foreign_target
+from imfvla.errors import UserError
+from imfvla.policy import build_policy
+from imfvla.recording import McapSink, read_episode
+from imfvla.run_directory import RunDirectory
+
+ROOT = Path(__file__).resolve().parent.parent
+TREE = subprocess.run(
+    ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+    cwd=ROOT, capture_output=True, text=True, check=True,
+).stdout.splitlines()  # fmt: skip
+
+
+def load_tool(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def fuzz():
+    path = list(sys.path)
+    yield load_tool("fuzz")
+    sys.path[:] = path
+
+
+@pytest.fixture(scope="module")
+def targets(fuzz, tmp_path_factory):
+    return fuzz.make_targets(tmp_path_factory.mktemp("targets"))
+
+
+READERS = (
+    "mcap", "mcap_index", "state", "weights", "pretrained", "config", "status", "summary", "episodes", "partial",
+    "metrics", "curve", "depth_attention", "store_meta", "store_array", "tables",
+)  # fmt: skip
+
+
+def test_every_reader_is_fuzzed(targets):
+    assert tuple(targets) == READERS
+
+
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(10**6, 2**32))
+def test_of_a_damaged_file_comes_a_value_or_a_user_error(fuzz, targets, name, seed):
+    tally = fuzz.fuzz(targets[name], 1, seed)
+    assert not tally.failures
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(content=st.binary(max_size=200))
+@pytest.mark.parametrize("name", ["mcap", "state", "config", "summary", "metrics", "store_array"])
+def test_of_any_bytes_comes_a_value_or_a_user_error(fuzz, targets, name, content):
+    target = fuzz.Target(targets[name].path, targets[name].read, lambda data, rng: content)
+    assert not fuzz.fuzz(target, 1, 0).failures
+
+
+def test_the_fuzzer_tells_another_error_and_a_reader_that_does_not_end(fuzz, tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"whole")
+
+    def read(path):
+        if len(path.read_bytes()) > 2:
+            raise KeyError("a slip of ours")
+        while True:
+            pass
+
+    monkeypatch.setattr(fuzz, "MAX_SECONDS", 0.05)
+    cut = fuzz.Target(tmp_path / "file", read, lambda data, rng: data[: rng.randrange(len(data) + 1)])
+    failures = fuzz.fuzz(cut, 8, 0).failures
+    assert len(failures) == 8
+    assert any("a slip of ours" in failure for failure in failures)
+    assert any("TooSlow" in failure for failure in failures)
+    assert (tmp_path / "file").read_bytes() == b"whole"
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "imfvla.files.os.system",
+        "imfvla.files.write_text",
+        "imfvla.encoders.vision.torch.load",
+        "imfvla.nn.pretrained.load_file",
+        "imfvla.nn.residual.nn.Module",
+        "imfvla.training.logger.MetricsLogger",
+        "imfvla.nn",
+        "imfvla.nn.nowhere.Core",
+        "torch.load",
+        "torch.optim.lr_scheduler.LambdaLR",
+        "torch.optim.lr_scheduler",
+        "hydra.utils.call",
+        "builtins.eval",
+        "",
+        None,
+        ["imfvla.nn.transformer.TransformerCore"],
+    ],
+)
+def test_a_config_cannot_name_what_is_run(target):
+    with pytest.raises(UserError, match="must not choose what is run"):
+        construct({"_target_": "imfvla.generators.base.UniformTimes", "part": [{"_target_": target}]}, "core")
+
+
+def test_our_parts_and_torchs_optimisers_may_be_named():
+    refuse_foreign_target("torch.optim.AdamW", "optim._target_")
+    assert construct({"_target_": "imfvla.generators.base.UniformTimes"}, "times") is not None
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    name=st.lists(
+        st.sampled_from(["imfvla", "nn", "files", "os", "torch", "optim", "a", "__class__"]), max_size=5
+    )
+)
+def test_whatever_is_named_is_refused_or_a_class_of_ours(name):
+    with pytest.raises(UserError, match="must name a class defined in"):
+        refuse_foreign_target(".".join(name), "core._target_")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("_args_", [1], "_args_ is not allowed"),
+        ("_recursive_", False, "_recursive_ is not allowed"),
+        ("width", "${oc.env:HOME}", "must be a plain value, found the interpolation"),
+    ],
+)
+def test_hydras_other_powers_are_refused(key, value, message):
+    config = compose("train", ["+exp=socket_ph32_exec16"])
+    config["core"][key] = value
+    with pytest.raises(UserError, match=message):
+        build_policy(config)
+
+
+def test_a_run_directory_of_a_stranger_runs_nothing(tmp_path):
+    """The config is read and refused; what it names is never called."""
+    run = RunDirectory(tmp_path / "run")
+    config = compose("train", ["+exp=socket_ph32_exec16"])
+    config["generator"] = {"_target_": "imfvla.files.os.system", "command": f"touch {tmp_path}/owned"}
+    run.claim(config)
+    with pytest.raises(UserError, match=r"generator\._target_ must name a class"):
+        build_policy(run.config())
+    assert not (tmp_path / "owned").exists()
+
+
+PICKLERS = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "pandas"}
+# Calls that read or write pickles, or run text, beside those modules. `np.load` does unless it is told not to.
+FORBIDDEN_CALLS = {
+    "torch.load",
+    "torch.save",
+    "read_pickle",
+    "to_pickle",
+    "unsafe_load",
+    "eval",
+    "exec",
+    "full_load",
+}
+
+
+@pytest.mark.parametrize("path", [path for path in TREE if path.endswith(".py")])
+def test_no_code_reads_or_writes_pickles(path):
+    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+        if isinstance(node, ast.Import):
+            assert not {name.name.split(".")[0] for name in node.names} & PICKLERS
+        elif isinstance(node, ast.ImportFrom):
+            assert (node.module or "").split(".")[0] not in PICKLERS
+        elif isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            # a test may write the pickle that is to be refused
+            assert called not in FORBIDDEN_CALLS or path.startswith("tests/")
+            if called in ("np.load", "np.save", "np.savez", "numpy.load"):
+                (allowed,) = [word.value for word in node.keywords if word.arg == "allow_pickle"]
+                assert allowed.value is False
+            if called.endswith(("_object_list", "gather_object")):
+                raise AssertionError(f"{called} pickles what it sends")
+
+
+def test_no_file_of_the_tree_is_a_pickle():
+    suffixes = {".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib", ".npy", ".npz"}
+    assert not [path for path in TREE if Path(path).suffix in suffixes]
+    for path in TREE:
+        start = (ROOT / path).read_bytes()[:2] if (ROOT / path).is_file() else b""
+        assert start not in (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05"), path
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(overrides=st.lists(st.text(max_size=30), max_size=4))
+def test_a_run_is_named_within_its_folder(overrides):
+    name = run_name(overrides)
+    assert name not in ("", ".", "..")
+    assert not {"/", "\\", "\0"} & set(name)
+    assert len(os.fsencode(name)) < 200
+
+
+def test_an_attachment_is_read_and_never_written(fuzz, tmp_path):
+    """Attachments whose names are paths leave no file anywhere."""
+    write_episode(tmp_path / "a.mcap", 0, num_steps=3, views=("front",), image_size=(16, 16))
+    renamed = (tmp_path / "a.mcap").read_bytes().replace(b"config.json", b"../../a.txt")
+    (tmp_path / "a.mcap").write_bytes(renamed)
+    with pytest.raises(UserError, match=r"a\.mcap is truncated or corrupt"):
+        read_episode(tmp_path / "a.mcap")  # its checksum is of the old name
+    assert [path.name for path in tmp_path.rglob("*")] == ["a.mcap"]
+    assert McapSink(tmp_path / "b.mcap").path.parent == tmp_path
