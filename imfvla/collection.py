@@ -21,6 +21,9 @@ from imfvla.rollout import run_episode
 
 SEED_LIMIT = 10_000  # demonstrations may use the seeds below
 LOG_NAME = "collection.json"
+EPISODE_TIMEOUT_S = (
+    900.0  # a demonstration takes seconds; a worker that takes longer hangs in its graphics driver
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +144,7 @@ def _record_missing(
 
     num_new, title = 0, f"demonstrations of {settings.task}"
     with (
-        worker_pool(min(workers, len(batch))) as run_all,
+        worker_pool(min(workers, len(batch)), EPISODE_TIMEOUT_S) as run_all,
         Progress(title, options.episodes, done=options.episodes - len(batch)) as bar,
     ):
         while batch:
@@ -179,13 +182,18 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     """Plays the expert from `seed` into its file; of a failed demonstration no file is left. Runs in a worker."""
     env, expert = _stage_for(settings)
     path = _path(directory, seed)
-    sink = McapSink(path, lossless=True, render_every=settings.camera_every)
+    trial = path.with_suffix(
+        ".mcap.trial"
+    )  # until it has succeeded: a kill must not leave a failure under its name
+    sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
     sentences = {"paraphrases": env.paraphrases}
     result = run_episode(
         env, expert, seed, [sink], kind="demonstration", config=asdict(settings), metadata=sentences
     )
-    if not result.success:
-        path.unlink()
+    if result.success:
+        trial.replace(path)
+    else:
+        trial.unlink()
     return seed, result.success
 
 

@@ -63,8 +63,18 @@ def run_name(overrides: Sequence[str]) -> str:
     return name or "default"
 
 
+def plain_name(name: str) -> str:
+    """`name` itself. Raises UserError where it is a path, which would lead out of the folder of all runs."""
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.,=+-]*", str(name)):
+        raise UserError(
+            f"name must have letters, digits and _.,=+- alone, found {name!r}: choose another name=..."
+        )
+    return str(name)
+
+
 def register_resolvers() -> None:
-    """Makes `${run_name:overrides}` and `${count:list}` known to the configs. May be called again."""
+    """Makes `run_name`, `plain_name` and `count` known to the configs, as `${count:list}`. May be called again."""
+    OmegaConf.register_new_resolver("plain_name", plain_name, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
     OmegaConf.register_new_resolver("count", len, replace=True)
 

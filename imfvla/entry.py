@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from imfvla import composition
 from imfvla.errors import UserError
 from imfvla.jobs import Failure, Job
+from imfvla.signals import Stopped, stoppable
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
 EXIT_FAILURE, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
@@ -29,11 +31,12 @@ def entry_point(
     """Decorator: `function(config)` becomes a command that composes `conf/<config_name>.yaml`.
 
     The function receives the resolved config as plain dicts and lists. The command `main(argv=None)` returns
-    on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C; 1
-    with a traceback after anything else. In a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run but
-    those that `is_finished(config, directory)` tells from their files; the failures are listed at the end.
-    The config overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory,
-    see `output_directory`, and its train.log) or both with `plain` (nothing written).
+    on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C, 143
+    after SIGTERM, 138 after SIGUSR1 (then the same command goes on); 1 with a traceback after anything else. In
+    a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run but those that
+    `is_finished(config, directory)` tells from their files; the failures are listed at the end. The config
+    overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory, see
+    `output_directory`, and its train.log) or both with `plain` (nothing written).
     """
 
     def decorate(function: Callable[[dict[str, Any]], None]) -> Callable[..., None]:
@@ -56,9 +59,11 @@ def output_directory() -> Path:
 
 def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
     composition.register_resolvers()
+    if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
+        arguments = [*arguments, "hydra/job_logging=disabled"]
     known = get_args_parser().parse_args(arguments)
     try:
-        with _hydra_raises(arguments):
+        with _hydra_raises(arguments), stoppable():
             composition.refuse_added_keys(job.config_name, known.overrides)
             if _is_sweep(known):
                 failures = run_sweep(job, known.overrides, is_finished)
@@ -67,6 +72,15 @@ def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
                 failures = [job.failure] if job.failure else []
     except (HydraException, OmegaConfBaseException, UserError) as error:
         failures = [Failure.of(error, job.config_name, " ".join(known.overrides))]
+    except Stopped as stop:
+        name = signal.Signals(stop.number).name
+        told = (
+            "Interrupted."
+            if stop.number == signal.SIGINT
+            else f"Stopped by {name}; the same command goes on."
+        )
+        print(told, file=sys.stderr)
+        return stop.exit_code
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -23,6 +23,9 @@ def _evaluate(config: dict[str, Any]) -> None:
         require(_is_whole(config[key]), key, "a whole number", config[key])
     for key in ("workers", "max_steps"):
         require(config[key] is None or _is_whole(config[key]), key, "null or a whole number", config[key])
+    timeout_s = config["episode_timeout_s"]
+    is_number = _is_whole(timeout_s) or isinstance(timeout_s, float)
+    require(timeout_s is None or is_number, "episode_timeout_s", "null or a number of seconds", timeout_s)
     run = RunDirectory(config["run"])
     options = {key: value for key, value in config.items() if key not in ("run", "nfe")}
     summaries = evaluate(run, nfe=read_nfe(config["nfe"]), **options)

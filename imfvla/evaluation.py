@@ -15,7 +15,7 @@ from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory, flatten
 from imfvla.workbench import Build, Job, gl_renderer, load_workbench, record, roll_out
-from imfvla.workers import RunAll, worker_pool
+from imfvla.workers import Here, Pool, worker_pool
 
 REQUIRED_KEYS = ("name", "task.name", "task.variant", "observation.views", "observation.image_size")
 
@@ -58,6 +58,7 @@ def evaluate(
     first_seed: int,
     nfe: Sequence[int],
     workers: int | None = None,
+    episode_timeout_s: float | None = None,
     checkpoint: int | str = "last",
     noise_seed: int = 0,
     max_steps: int | None = None,
@@ -75,6 +76,7 @@ def evaluate(
 
     Args:
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
+      episode_timeout_s: an episode that takes a worker longer is played again by a fresh one; None: no limit.
       checkpoint: training step of the weights, or "last".
       noise_seed: of the noise streams; equal for policies that are to be compared.
       max_steps: control steps of an episode, None for all.
@@ -85,13 +87,19 @@ def evaluate(
       The summaries, in the order of `nfe`.
 
     Raises:
-      UserError: no run, no such weights, numbers out of range, or a worker that died.
+      UserError: no run, no such weights, numbers out of range, or an episode whose workers died.
     """
     nfe = tuple(nfe)
     require(episodes >= 1, "episodes", "at least 1", episodes)
     require(first_seed >= 0, "first_seed", "at least 0", first_seed)
     require(bool(nfe) and min(nfe) >= 1, "nfe", "one or more whole numbers of at least 1", list(nfe))
     require(workers is None or workers >= 0, "workers", "null or at least 0", workers)
+    require(
+        episode_timeout_s is None or episode_timeout_s > 0,
+        "episode_timeout_s",
+        "null or above 0",
+        episode_timeout_s,
+    )
     require(max_steps is None or max_steps >= 1, "max_steps", "null or at least 1", max_steps)
     require(device in ("cpu", "cuda"), "device", "cpu or cuda", device)
     require(
@@ -110,7 +118,7 @@ def evaluate(
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     count = physical_cores() if workers is None else workers
     summaries = []
-    with worker_pool(count) as run_all:
+    with worker_pool(count, episode_timeout_s) as run_all:
         for number in nfe:
             protocol = Protocol(
                 task=config["task"]["name"],
@@ -128,6 +136,7 @@ def evaluate(
             name = protocol.name(run.weight_steps()[-1])
             with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=overwrite) as rollouts:
                 if rollouts.summary is None:
+                    incidents_before = run_all.incidents
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
                     files = _record_some(job, rows, rollouts, run_all) if recordings else {}
                     (renderer,) = run_all(gl_renderer, [(job,)])
@@ -140,6 +149,7 @@ def evaluate(
                         "seeds": [protocol.seeds[0], protocol.seeds[-1]],
                         "protocol": asdict(protocol),
                         "recordings": files,
+                        "worker_incidents": run_all.incidents - incidents_before,
                         "fingerprint": fingerprint(threads=1, workers=count, gl_renderer=renderer),
                     }
                     rollouts.finish(rows, summary)
@@ -147,7 +157,7 @@ def evaluate(
     return summaries
 
 
-def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: RunAll) -> list[Row]:
+def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: Here | Pool) -> list[Row]:
     """The rows of all seeds, ordered, those that were missing freshly made."""
     rows = {row["seed"]: row for row in rollouts.rows}
     missing = [seed for seed in protocol.seeds if seed not in rows]
@@ -159,7 +169,7 @@ def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: R
     return [rows[seed] for seed in protocol.seeds]
 
 
-def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: RunAll) -> dict[str, Any]:
+def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: Here | Pool) -> dict[str, Any]:
     """Plays the best, the median and the worst episode again into files; says which they are."""
     chosen = best_median_worst(rows)
     paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}

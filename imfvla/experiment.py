@@ -24,7 +24,9 @@ from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_dig
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.parallel import Alone, joined_processes
 
+STAGES = TRAIN, EVALUATE = "train", "evaluate"
 INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,7 @@ class EvaluationOptions:
     noise_seed: int
     device: str
     workers: int | None
+    episode_timeout_s: float | None
 
     def __post_init__(self) -> None:
         require(self.episodes >= 1, "evaluation.episodes", "at least 1", self.episodes)
@@ -64,13 +67,31 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         policy.generator.check_nfe(nfe)
     seed = config["seed"]
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
+    with joined_processes(training.device) as processes:
+        if processes.is_first:
+            _run_stages(config, run, training, optim, evaluation, processes)
+        elif processes.first_of(STAGES, TRAIN) == TRAIN:
+            _train(config, run, training, optim, processes)
+
+
+def _run_stages(
+    config: Mapping[str, Any],
+    run: RunDirectory,
+    training: TrainingOptions,
+    optim: OptimOptions,
+    evaluation: EvaluationOptions,
+    processes: Alone,
+) -> None:
+    """All but the shares of the other processes."""
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         try:
-            if training.steps in run.weight_steps():
+            is_trained = training.steps in run.weight_steps()
+            processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)
+            if is_trained:
                 log.info(f"{run.path} is trained already: all {training.steps} steps are done.")
             else:
-                _train(config, run, training, optim)
+                _train(config, run, training, optim, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
             evaluate(run, **asdict(evaluation))  # of a finished evaluation it only reads the summary
             if run.status().get("state") != DONE:
@@ -86,11 +107,20 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
 
 
 def _train(
-    config: Mapping[str, Any], run: RunDirectory, training: TrainingOptions, optim: OptimOptions
+    config: Mapping[str, Any],
+    run: RunDirectory,
+    training: TrainingOptions,
+    optim: OptimOptions,
+    processes: Alone,
 ) -> None:
-    run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
-    windows = prepare_windows(config, ensure_demonstrations(config))
-    run.write_status(RUNNING, phase="training", pid=os.getpid())
+    if processes.is_first:
+        run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
+        windows = prepare_windows(config, ensure_demonstrations(config))
+        run.write_status(RUNNING, phase="training", pid=os.getpid())
+        processes.wait()
+    else:
+        processes.wait()  # for demonstrations and frame store, which are there then
+        windows = prepare_windows(config, ensure_demonstrations(config))
     seed = config["seed"]
     initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
@@ -112,5 +142,6 @@ def _train(
             "num_parameters": num_parameters,
             "config_digest": config_digest(config, EXECUTION_KEYS),
         },
+        processes=processes,
     )
     trainer.train()

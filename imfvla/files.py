@@ -24,6 +24,9 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     with clear_write_errors(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.unlink(
+                missing_ok=True
+            )  # of a killed process, or a link that somebody left to elsewhere
             write(temporary)
             sync(temporary)
             os.replace(temporary, path)
@@ -103,6 +106,8 @@ def clear_write_errors(path: Path) -> Any:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             remedy = "free some space there and run the same command again; what was written before is intact"
+        elif error.errno in (errno.EMFILE, errno.ENFILE):
+            remedy = "no file handle is left: raise the limit (ulimit -n 4096) and run the same command again"
         else:
             remedy = (
                 "check that the directory is there and may be written to, then run the same command again"

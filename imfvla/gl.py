@@ -2,10 +2,13 @@
 
 import ctypes
 import os
+import threading
+from collections.abc import Callable
 
 from imfvla.errors import UserError
 
 BACKENDS = ("egl", "osmesa", "glfw", "cgl", "wgl")
+PROBE_TIMEOUT_S = 20.0  # a driver answers within a second, or never
 _REMEDY = (
     "install one of them, on Debian or Ubuntu: `sudo apt-get install -y libegl1 libgl1-mesa-dri` "
     "(EGL) or `sudo apt-get install -y libosmesa6` (OSMesa)"
@@ -26,9 +29,9 @@ def select_gl_backend() -> str:
         raise UserError(
             f"MUJOCO_GL must be one of {', '.join(BACKENDS)}, found {wanted!r}; unset it or mend it."
         )
-    if wanted in _PROBES and not _PROBES[wanted]():
+    if wanted in _PROBES and not _answers(_PROBES[wanted]):
         raise UserError(f"MUJOCO_GL={wanted} was asked for, but {wanted} cannot be loaded here; {_REMEDY}.")
-    backend = wanted or next((name for name, probe in _PROBES.items() if probe()), None)
+    backend = wanted or next((name for name, probe in _PROBES.items() if _answers(probe)), None)
     if backend is None:
         raise UserError(
             f"MuJoCo needs EGL or OSMesa to render the cameras, but neither can be loaded; {_REMEDY}."
@@ -38,6 +41,15 @@ def select_gl_backend() -> str:
         os.environ["PYOPENGL_PLATFORM"] = backend
     os.environ.setdefault("LP_NUM_THREADS", "0")
     return backend
+
+
+def _answers(probe: Callable[[], bool]) -> bool:
+    """Whether `probe` finds its backend in time; a driver that hangs is one that is not there."""
+    found: list[bool] = []
+    thread = threading.Thread(target=lambda: found.append(probe()), daemon=True)
+    thread.start()
+    thread.join(PROBE_TIMEOUT_S)
+    return found == [True]
 
 
 def _has_egl() -> bool:

@@ -1,5 +1,6 @@
 """One job of a command, as Hydra's launchers run it, here or on another machine: a failure comes back as a value."""
 
+import errno
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +13,15 @@ from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
 from imfvla.errors import UserError
+
+# What of the system's own errors the user can mend.
+SYSTEM_REMEDIES = {
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space",
+    errno.EROFS: "choose a directory that may be written to",
+    errno.EMFILE: "no file handle is left, raise the limit with ulimit -n 4096",
+    errno.ENFILE: "no file handle is left, stop other programs",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +36,11 @@ class Failure:
     def of(cls, error: Exception, config_name: str, overrides: str) -> "Failure":
         if isinstance(error, HydraException | OmegaConfBaseException):
             error = composition.explain(error, config_name, overrides.split())
+        if isinstance(error, OSError) and error.errno in SYSTEM_REMEDIES:
+            file = f" at {error.filename}" if error.filename else ""
+            error = UserError(
+                f"{error.strerror}{file}: {SYSTEM_REMEDIES[error.errno]}; run the same command again."
+            )
         if isinstance(error, UserError):
             return cls(overrides, str(error), True)
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)

@@ -24,13 +24,14 @@ class Progress:
 
     _display: ClassVar[rich_progress.Progress | None] = None  # of the outermost bar that is entered
 
-    def __init__(self, title: str, total: int, done: int = 0) -> None:
+    def __init__(self, title: str, total: int, done: int = 0, shown: bool = True) -> None:
         self._title, self._total, self._done, self._already = title, total, done, done
+        self._shown = shown
         self._bar: rich_progress.Progress | None = None
 
     def __enter__(self) -> "Progress":
         self._began = self._last_line = time.monotonic()
-        if sys.stderr.isatty():
+        if self._shown and sys.stderr.isatty():
             self._is_outermost = Progress._display is None
             self._bar = Progress._display or rich_progress.Progress(
                 rich_progress.TextColumn("{task.description}"),
@@ -59,7 +60,7 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, completed=self._done, note=note, end=now + left)
             return
-        if now - self._last_line >= LINE_EVERY_S or self._done == self._total:
+        if self._shown and (now - self._last_line >= LINE_EVERY_S or self._done == self._total):
             self._last_line = now
             log.info(
                 "%s: %d of %d  %s  %.0f s, %.0f s left",

@@ -32,6 +32,7 @@ EXECUTION_KEYS = (
     "demos.directory",
     "training.threads",
     "training.compile",
+    "training.on_non_finite",
     "training.prefetch",
     "training.log_every",
     "training.save_every_s",

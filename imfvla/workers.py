@@ -1,45 +1,183 @@
-"""Work shared out to fresh processes with one thread each, or done in this one."""
+"""Work shared out to fresh processes with one thread each, or done in this one.
 
+A process that dies, or takes longer than it may (a graphics driver that hangs), is replaced, and its call made again.
+"""
+
+import logging
 import multiprocessing
 import os
+import signal
+import threading
+import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from multiprocessing import connection
 from typing import Any
 
 from imfvla.errors import UserError
+from imfvla.signals import SIGNALS
 
-RunAll = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[Any]]
+MAX_ATTEMPTS = 3  # of one call: what kills three workers kills the next one too
+log = logging.getLogger(__name__)
+
+
+class Here:
+    """Does the calls one by one in this process, each when its result is asked for."""
+
+    incidents = 0
+
+    def __call__(self, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        return (function(*arguments) for arguments in calls)
+
+
+class Pool:
+    """Does the calls in `count` processes; results come as they complete. `incidents` counts replaced processes."""
+
+    def __init__(self, count: int, timeout_s: float | None) -> None:
+        self.incidents = 0
+        self._timeout_s = timeout_s
+        self._workers = [_Worker() for _ in range(count)]
+
+    def __call__(self, function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        waiting = list(enumerate(calls))[::-1]
+        attempts = [0] * len(calls)
+        busy: dict[_Worker, tuple[int, tuple[Any, ...], float]] = {}
+        try:
+            while waiting or busy:
+                for worker in [worker for worker in self._workers if worker not in busy][: len(waiting)]:
+                    number, arguments = waiting.pop()
+                    attempts[number] += 1
+                    worker.send(function, arguments)
+                    busy[worker] = (number, arguments, time.monotonic())
+                for worker, outcome in self._outcomes(busy):
+                    number, arguments, _ = busy.pop(worker)
+                    if isinstance(outcome, _Lost):
+                        self._replace(worker, outcome, attempts[number])
+                        waiting.append((number, arguments))
+                        continue
+                    succeeded, value = outcome
+                    if not succeeded:
+                        raise value
+                    yield value
+        finally:
+            for worker in busy:  # somebody stopped listening: nobody wants the results
+                self._workers[self._workers.index(worker)] = _Worker(after=worker)
+
+    def _outcomes(self, busy: dict["_Worker", Any]) -> list[tuple["_Worker", Any]]:
+        """What has come of the calls under way: at least one result or loss."""
+        while True:
+            timeout = None
+            if self._timeout_s is not None:
+                oldest = min(began for _, _, began in busy.values())
+                timeout = max(0.0, oldest + self._timeout_s - time.monotonic())
+            ready = connection.wait([worker.connection for worker in busy], timeout)
+            found = [(worker, worker.receive()) for worker in busy if worker.connection in ready]
+            if found:
+                return found
+            late = time.monotonic() - (self._timeout_s or 0.0)
+            hanging = _Lost(f"gave no answer within {self._timeout_s:g} s")
+            if found := [(worker, hanging) for worker, (_, _, began) in busy.items() if began <= late]:
+                return found
+
+    def _replace(self, worker: "_Worker", loss: "_Lost", attempts: int) -> None:
+        self.incidents += 1
+        self._workers[self._workers.index(worker)] = _Worker(after=worker)
+        if attempts == MAX_ATTEMPTS:
+            raise UserError(
+                f"A worker process {loss}, {attempts} times over the same episode: if it died, perhaps for want of "
+                "memory: choose fewer workers=...; if it hangs, try export MUJOCO_GL=osmesa. Then run the same "
+                "command again; finished episodes are kept."
+            )
+        log.warning("A worker process %s: its episode is made again in a fresh one.", loss)
+
+    def close(self) -> None:
+        for worker in self._workers:
+            worker.end()
 
 
 @contextmanager
-def worker_pool(count: int) -> Iterator[RunAll]:
+def worker_pool(count: int, timeout_s: float | None = None) -> Iterator[Here | Pool]:
     """Yields `run_all(function, calls)`: results of `function(*arguments)` for each call, as they complete.
 
-    The work is done in `count` fresh processes with one thread each, or in this one for 0.
-    Raises UserError where a worker dies.
+    The work is done in `count` fresh processes with one thread each, or in this one for 0. A process that dies or
+    takes more than `timeout_s` over a call is replaced, and the call made again; `run_all.incidents` counts these.
+    Raises UserError where a call meets with that three times.
     """
     if count == 0:
-        yield lambda function, calls: (function(*arguments) for arguments in calls)
+        yield Here()
         return
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"  # inherited by the workers, which read it when they load torch
-    executor = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
-
-    def run_all(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        for future in as_completed([executor.submit(function, *arguments) for arguments in calls]):
-            yield future.result()
-
     try:
-        yield run_all
-    except BrokenProcessPool as error:
-        raise UserError(
-            "A worker process died, perhaps for want of memory: choose fewer workers=... and run the same "
-            "command again; finished episodes are kept."
-        ) from error
+        pool = Pool(count, timeout_s)
+        try:
+            yield pool
+        finally:
+            pool.close()
     finally:
-        executor.shutdown(cancel_futures=True)
         os.environ.pop("OMP_NUM_THREADS")
         if before is not None:
             os.environ["OMP_NUM_THREADS"] = before
+
+
+class _Lost(str):
+    """What became of a worker that answers no more."""
+
+
+class _Worker:
+    """A process that serves calls until this one ends; `after` is the worker whose place it takes."""
+
+    def __init__(self, after: "_Worker | None" = None) -> None:
+        if after is not None:
+            after.end()
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()  # so that its death closes the connection
+
+    def send(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+        with suppress(BrokenPipeError, ConnectionResetError):  # dead already, which `receive` tells
+            self.connection.send((function, arguments))
+
+    def receive(self) -> tuple[bool, Any] | _Lost:
+        try:
+            return self.connection.recv()
+        except (EOFError, ConnectionResetError):
+            self._process.join()
+            return _Lost(f"died (exit code {self._process.exitcode})")
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+
+def _serve(calls: connection.Connection) -> None:
+    """Answers (function, arguments) with (whether it succeeded, result or exception)."""
+    for number in SIGNALS:  # meant for the process that shares the work out; a terminal sends them to all
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    while True:
+        try:
+            function, arguments = calls.recv()
+        except EOFError:
+            return
+        try:
+            answer = (True, function(*arguments))
+        except Exception as error:
+            error.add_note(f"In a worker process:\n{traceback.format_exc()}")
+            answer = (False, error)
+        try:
+            calls.send(answer)
+        except (TypeError, AttributeError, ValueError) as error:  # what cannot be sent
+            calls.send((False, RuntimeError(f"{answer[1]!r} cannot be sent back: {error}")))
+
+
+def _die_with_parent() -> None:
+    """Ends this process with the one that started it: after a SIGKILL none must go on writing files."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)

@@ -130,3 +130,24 @@ def test_without_rights_the_installer_prints_the_one_command_and_fails(tmp_path)
     assert "sudo apt-get update && sudo apt-get install -y" in installer.stderr
     assert "libegl1 libegl-mesa0 libgl1-mesa-dri" in installer.stderr
     assert not (tmp_path / "called").exists()
+
+
+@pytest.mark.parametrize(
+    ("digests", "gradients", "words"),
+    [
+        ("aa", "xx", "repeat bit for bit here"),
+        ("ab", "xx", "a and b"),
+        ("aa", "xy", "training steps .* differ"),
+    ],
+)
+def test_what_does_not_repeat_is_named_with_its_remedy(doctor, monkeypatch, digests, gradients, words):
+    frames, steps = iter(digests), iter(gradients)
+    monkeypatch.setattr(doctor, "_render_in_child", lambda *_: ({"digest": next(frames)}, ""))
+    monkeypatch.setattr(doctor, "_training_digest", lambda: next(steps))
+    finding = doctor.check_repeats()
+    assert re.search(words, finding.text)
+    assert (finding.remedy is None) == (digests + gradients == "aaxx")
+
+
+def test_a_training_step_repeats(doctor):
+    assert doctor._training_digest() == doctor._training_digest()

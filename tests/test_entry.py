@@ -1,4 +1,6 @@
+import errno
 import os
+import signal
 import subprocess
 import sys
 
@@ -21,6 +23,11 @@ def command(config):
         raise ZeroDivisionError("a slip of ours")
     if config["seed"] == 3:
         raise KeyboardInterrupt
+    if config["seed"] == 7:
+        raise OSError(errno.EMFILE, "Too many open files", "data.bin")
+    if config["seed"] >= 100:
+        os.kill(os.getpid(), config["seed"] - 100)
+        signal.pause()
     (output_directory() / "done").write_text(type(config["horizon"]).__name__)
 
 
@@ -39,6 +46,15 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
         (["seed=1"], 2, "seed 1 is bad.\n"),
         (["+exp=nope"], 2, None),
         (["seed=3"], 130, "Interrupted.\n"),
+        (["seed=102"], 130, "Interrupted.\n"),
+        (["seed=115"], 143, "Stopped by SIGTERM; the same command goes on.\n"),
+        (["seed=110"], 138, "Stopped by SIGUSR1; the same command goes on.\n"),
+        (
+            ["seed=7"],
+            2,
+            "Too many open files at data.bin: no file handle is left, raise the limit with ulimit -n 4096; run the "
+            "same command again.\n",
+        ),
     ],
 )
 def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
@@ -92,3 +108,13 @@ def test_train_command_tells_a_slip_in_one_line(tmp_path):
     assert done.stdout == ""
     assert done.stderr.startswith("Unknown exp 'nope': conf/exp has ")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["../escaped", "/tmp/escaped", "..", "a/b", ".hidden", ""])
+def test_a_name_that_is_a_path_is_refused_before_a_directory_is_made(tmp_path, capfd, name):
+    with pytest.raises(SystemExit) as exit_:
+        command([f"name='{name}'"])
+    assert exit_.value.code == 2
+    assert "name must have letters, digits" in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path.parent / "escaped").exists()

@@ -168,12 +168,49 @@ def check_disk(root: Path = ROOT) -> Finding:
     return Finding("disk", text)
 
 
+def check_repeats(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
+    """The same work twice gives the same bits: a frame in two processes, a training step in this one."""
+    import torch
+
+    frames = [_render_in_child({}, timeout_s)[0] for _ in range(2)]
+    digests = {frame["digest"] for frame in frames if frame is not None}
+    steps = {_training_digest() for _ in range(2)}
+    threads = torch.get_num_threads()
+    if len(digests) != 1:
+        found = " and ".join(sorted(digests)) or "no frame"
+        return Finding("repeats", f"two renderings of one scene: {found}", "export MUJOCO_GL=osmesa")
+    if len(steps) != 1:
+        text = f"two equal training steps on {threads} threads differ"
+        return Finding("repeats", text, "set training.threads=1")
+    text = f"frames (digest {digests.pop()}) and CPU training ({threads} threads) repeat bit for bit here"
+    text += "; not so: another number of threads or processes, another CPU or torch (rounding), times"
+    if torch.cuda.is_available():
+        text += "; training on this GPU (for the same bits: training.device=cpu)"
+    return Finding("repeats", text)
+
+
+def _training_digest() -> str:
+    """Of the gradients of a small convolution and matrix product."""
+    import hashlib
+
+    import torch
+
+    rng = torch.Generator().manual_seed(0)
+    images, kernel = torch.randn(8, 3, 32, 32, generator=rng), torch.randn(16, 3, 3, 3, generator=rng)
+    matrix = torch.randn(16 * 900, 64, generator=rng)
+    kernel.requires_grad_(), matrix.requires_grad_()
+    (torch.conv2d(images, kernel).flatten(1).relu() @ matrix).square().mean().backward()
+    content = kernel.grad.numpy().tobytes() + matrix.grad.numpy().tobytes()
+    return hashlib.sha256(content).hexdigest()
+
+
 CHECKS: dict[str, Callable[[], Finding]] = {
     "python": check_python,
     "machine": check_machine,
     "threads": check_threads,
     "packages": check_packages,
     "gl": check_gl,
+    "repeats": check_repeats,
     "video": check_video,
     "disk": check_disk,
 }

@@ -299,7 +299,7 @@ def make_targets(folder: Path) -> dict[str, Target]:
         "depth_attention": (depth, lambda path: read_depth_attention(path.parent), mutate_json),
         "store_meta": (store / "meta.json", lambda path: FrameStore.open(path.parent), mutate_json),
         "store_array": (store / "state.npy", lambda path: FrameStore.open(path.parent), mutate_bytes),
-        "tables": (tables, read_mapping, mutate_yaml),
+        "tables": (tables, read_mapping.__wrapped__, mutate_yaml),
     }
     return {name: Target(*reader) for name, reader in readers.items()}
 

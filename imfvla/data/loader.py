@@ -62,6 +62,10 @@ class Loader(Iterator[Batch]):
             return batch
         return replace(batch, obs=replace(batch.obs, images=self._augment(batch.obs.images, rng)))
 
+    def describe(self, number: int) -> list[str]:
+        """Episode file and step of each row of batch `number`."""
+        return self._windows.describe(self._sampler.batch(number))
+
     def state_dict(self) -> dict[str, int]:
         """The sampler's state: the next batch to hand out."""
         return self._sampler.state_dict()

@@ -50,6 +50,11 @@ class Windows:
         actions = torch.from_numpy(self.store.action[self._followed[indices]])
         return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
 
+    def describe(self, indices: np.ndarray) -> list[str]:
+        """Episode file and decision step of each window."""
+        files = [self.store.episodes[number].file for number in self.episodes[indices]]
+        return [f"{file}, step {step}" for file, step in zip(files, self.steps[indices], strict=True)]
+
     def statistics(self) -> Statistics:
         """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
         store = self.store

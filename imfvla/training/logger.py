@@ -29,6 +29,7 @@ class MetricsLogger:
         self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
         self._sums: dict[str, float] = dict(state["sums"]) if state else {}
         self._count: int = state["count"] if state else 0
+        self._skipped: int = state.get("skipped", 0) if state else 0
 
     def add(self, scalars: Mapping[str, float]) -> None:
         """Takes in what one step measured."""
@@ -36,23 +37,48 @@ class MetricsLogger:
             self._sums[name] = self._sums.get(name, 0.0) + float(value)
         self._count += 1
 
+    def skip(self) -> None:
+        """Counts a step that was left out; its row says how many."""
+        self._skipped += 1
+
     def write(self, step: int, **extra: float) -> None:
         """One row: the means since the last row, and `extra` as it is."""
         row = {name: total / self._count for name, total in self._sums.items()} | extra
+        if self._skipped:
+            row["skipped"] = self._skipped
         with clear_write_errors(self._path):
             self._file.write(json.dumps({"step": step, **row}) + "\n")
             self._file.flush()
-        for name, value in row.items():
-            self._tensorboard.add_scalar(name, value, step)
-        self._sums, self._count = {}, 0
+            for name, value in row.items():
+                self._tensorboard.add_scalar(name, value, step)
+        self._sums, self._count, self._skipped = {}, 0, 0
 
     def state(self) -> dict[str, Any]:
         """Sums of the interval that has begun; JSON-able."""
-        return {"sums": dict(self._sums), "count": self._count}
+        return {"sums": dict(self._sums), "count": self._count, "skipped": self._skipped}
 
     def close(self) -> None:
         self._file.close()
         self._tensorboard.close()
+
+
+class SilentLogger(MetricsLogger):
+    """Of the processes that write nothing."""
+
+    def __init__(self, *_: Any) -> None:
+        pass
+
+    def add(self, scalars: Mapping[str, float]) -> None:
+        pass
+
+    def skip(self) -> None:
+        pass
+
+    def write(self, step: int, **extra: float) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

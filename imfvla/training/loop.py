@@ -21,15 +21,19 @@ from imfvla.fingerprint import code_version, fingerprint, physical_cores
 from imfvla.nn.compiled import compile_parts
 from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
+from imfvla.signals import Stopped, deferred_stop
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
 from imfvla.training.ema import Ema
-from imfvla.training.logger import MetricsLogger
+from imfvla.training.logger import MetricsLogger, SilentLogger
+from imfvla.training.non_finite import NonFinite, name_cause
 from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.parallel import Alone
 from imfvla.training.precision import autocast, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.types import Batch
 
+PRECISIONS = ("fp32", "bf16")
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
 log = logging.getLogger(__name__)
 
@@ -44,6 +48,7 @@ class Batches(Protocol):
     """Endless batches with a state, such as `imfvla.data.Loader`."""
 
     def __next__(self) -> Batch: ...
+    def describe(self, number: int) -> list[str]: ...  # episode and step of each row of batch `number`
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
     def close(self) -> None: ...
@@ -65,12 +70,16 @@ class Trainer:
         *,
         seed: int,
         description: Mapping[str, Any],
+        processes: Alone | None = None,  # those that share every batch; None for this one alone
     ) -> None:
-        torch.set_num_threads(options.threads or physical_cores())
+        self.processes = processes or Alone()
+        self.processes.check(options.batch_size, options.compile)
+        torch.set_num_threads(options.threads or max(1, physical_cores() // self.processes.local_size))
         self.device = choose_device(options.device)
         self.policy = policy.to(self.device)
         self.batches, self.run, self.options, self.optim = batches, run, options, optim
         self.seed, self.description = seed, dict(description)
+        self.processes.begin_alike(self.policy)
         self.ema = Ema(self.policy, optim.ema_decay)
         self.optimiser = make_optimiser(self.policy, optim)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
@@ -85,7 +94,9 @@ class Trainer:
             precision = details["precision"]
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
-        self.precision = precision or choose_precision(options.precision, self.device)
+        precision = precision or choose_precision(options.precision, self.device)
+        self.precision = self.processes.first_of(PRECISIONS, precision)
+        self.non_finite = NonFinite(options.on_non_finite)
         if options.compile:
             compile_parts(self.policy)
 
@@ -94,15 +105,24 @@ class Trainer:
         return self.step >= self.options.steps
 
     def train(self) -> None:
-        """Runs the remaining steps. Raises UserError on a non-finite loss or gradient, and on a full disk."""
+        """Runs the remaining steps; at a request to stop it saves the state and raises `Stopped`.
+
+        Raises UserError on a non-finite loss or gradient, and on a full disk.
+        """
+        if self.step in self.options.checkpoint_steps() and self.step not in self.run.weight_steps():
+            self._save_weights()  # which a kill has prevented after the state was saved
         if self.is_finished:
             return
         self.policy.train()
-        logger = MetricsLogger(self.run, self.step, self._logger_state)
+        kind = MetricsLogger if self.processes.is_first else SilentLogger
+        logger = kind(self.run, self.step, self._logger_state)
         with (
+            deferred_stop() as self._stop,
             closing(self.batches),
             closing(logger),
-            Progress("training", self.options.steps, done=self.step) as progress,
+            Progress(
+                "training", self.options.steps, done=self.step, shown=self.processes.is_first
+            ) as progress,
         ):
             self._loop(logger, progress)
 
@@ -112,10 +132,14 @@ class Trainer:
         spent_before, first_step, interval_step, waited = self.train_s, self.step, self.step, 0.0
         while not self.is_finished:
             before = time.perf_counter()
-            batch = next(self.batches).to(self.device)
+            batch = next(self.batches)
             waited += time.perf_counter() - before
             scalars = self._update(batch)
-            logger.add(scalars)
+            if scalars is None:
+                logger.skip()
+                scalars = {"loss": math.nan}
+            else:
+                logger.add(scalars)
             now = time.perf_counter()
             self.train_s = spent_before + now - start
             rate = (self.step - first_step) / (now - start)
@@ -127,14 +151,18 @@ class Trainer:
                     self.step, steps_per_s=rate, data_wait_fraction=waited / seconds, train_s=self.train_s
                 )
                 interval_start, interval_step, waited = now, self.step, 0.0
-            if self.step in keep_weights:
-                self._save_weights()
-            if self.step in keep_weights or self.is_finished or now - last_save >= self.options.save_every_s:
+            stop = self.processes.highest(self._stop.number or 0)
+            if self.step in keep_weights or stop or now - last_save >= self.options.save_every_s:
                 self._save_state(logger)
                 last_save = time.perf_counter()
+            if self.step in keep_weights:  # after the state: the last weights say that all is saved
+                self._save_weights()
+            if stop:
+                log.info(f"asked to stop: the state of step {self.step} is saved, the same command goes on")
+                raise Stopped(stop)
 
-    def _update(self, batch: Batch) -> dict[str, float]:
-        """One step of the optimiser; returns what to log."""
+    def _update(self, batch: Batch) -> dict[str, float] | None:
+        """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
         seed = step_seed(self.seed, self.step)
         torch.manual_seed(seed)  # for dropout and the like, which take no generator
         rate = learning_rate(
@@ -146,34 +174,42 @@ class Trainer:
         )
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        with autocast(self.precision, self.device):
-            loss, logs = self.policy.loss(batch, torch.Generator().manual_seed(seed))
-        loss_value = loss.item()
-        self._refuse_non_finite("loss", loss_value)
+        share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
+        with autocast(self.precision, self.device), self.processes.draws(rng, len(share.actions)):
+            loss, logs = self.policy.loss(share, rng)
+        loss_value, *means = self.processes.mean([loss.item(), *(value.item() for value in logs.values())])
+        if not math.isfinite(loss_value):
+            return self._skip("loss", loss_value, batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        self.processes.average_gradients(self.policy.parameters())
         norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm).item()
-        self._refuse_non_finite("norm of the gradient", norm)
+        if not math.isfinite(norm):
+            return self._skip("norm of the gradient", norm, batch)
         self.optimiser.step()
         self.ema.update(self.step)
         self.step += 1
-        return {"loss": loss_value, "grad_norm": norm, "lr": rate} | {
-            key: value.item() for key, value in logs.items()
-        }
+        self.non_finite.in_a_row = 0
+        return {"loss": loss_value, "grad_norm": norm, "lr": rate} | dict(zip(logs, means, strict=True))
 
-    def _refuse_non_finite(self, what: str, value: float) -> None:
-        if not math.isfinite(value):
-            kept = (
-                f"the state of step {self.saved_step} is kept"
-                if self.saved_step
-                else "no state was saved before"
-            )
-            raise UserError(
-                f"Training stopped at step {self.step + 1}, batch {self.step}: the {what} is {value}; {kept} "
-                f"in {self.run.path}. Lower optim.lr or optim.clip_norm, or set training.precision=fp32."
-            )
+    def _skip(self, what: str, value: float, batch: Batch) -> None:
+        """Leaves the weights as they are. Raises UserError where training is to stop."""
+        cause = name_cause(
+            self.policy,
+            batch.to(self.device),
+            step_seed(self.seed, self.step),
+            self.batches.describe(self.step),
+        )
+        kept = (
+            f"the state of step {self.saved_step} is kept" if self.saved_step else "no state was saved before"
+        )
+        self.non_finite.found(what, value, self.step, cause, f"{kept} in {self.run.path}")
+        self.optimiser.zero_grad(set_to_none=True)
+        self.step += 1
 
     def _save_weights(self) -> None:
+        if not self.processes.is_first:
+            return
         description = {
             "step": self.step,
             "train_s": round(self.train_s, 1),
@@ -184,6 +220,9 @@ class Trainer:
         save_weights(self.run.weights_directory(self.step), self.ema.policy, description)
 
     def _save_state(self, logger: MetricsLogger) -> None:
+        self.saved_step = self.step
+        if not self.processes.is_first:
+            return
         details = {
             "step": self.step,
             "train_s": self.train_s,
@@ -193,7 +232,6 @@ class Trainer:
             "code": code_version(),
         }
         save_state(self.run.last_state, self.state, details)
-        self.saved_step = self.step
 
 
 def step_seed(seed: int, step: int) -> int:

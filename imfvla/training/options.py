@@ -18,7 +18,8 @@ class TrainingOptions:
     precision: str  # fp32 | bf16 | auto
     compile: bool
     device: str  # cpu | cuda | auto
-    threads: int | None  # OpenMP threads, None for the physical cores
+    threads: int | None  # OpenMP threads of a process, None for its share of the physical cores
+    on_non_finite: str  # stop | skip: at a batch whose loss or gradient is not finite
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "log_every", "checkpoints", "prefetch"):
@@ -36,6 +37,12 @@ class TrainingOptions:
         )
         devices = ("cpu", "cuda", "auto")
         require(self.device in devices, "training.device", "one of " + ", ".join(devices), self.device)
+        require(
+            self.on_non_finite in ("stop", "skip"),
+            "training.on_non_finite",
+            "stop or skip",
+            self.on_non_finite,
+        )
         require(
             self.threads is None or self.threads >= 1, "training.threads", "null or at least 1", self.threads
         )

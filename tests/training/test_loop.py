@@ -1,4 +1,6 @@
 import json
+import math
+import os
 import signal
 import subprocess
 import sys
@@ -8,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
-from tiny_policy import TinyPolicy
+from tiny_policy import CountedBatches, TinyPolicy
 
 from imfvla.errors import UserError
+from imfvla.signals import Stopped
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import choose_device, step_seed
 
@@ -158,6 +161,81 @@ def test_stops_where_loss_or_gradient_is_not_finite(tmp_path, make_trainer, wher
     trainer = make_trainer(tmp_path)
     assert trainer.step == 2
     assert all(tensor.isfinite().all() for tensor in trainer.policy.state_dict().values())
+
+
+def test_what_is_not_finite_is_traced_to_its_row(tmp_path, make_trainer):
+    class OneBadRow(CountedBatches):
+        def __next__(self):
+            batch = super().__next__()
+            if self.next_batch == 3:
+                batch.actions[5, 0, 0] = torch.inf
+            return batch
+
+    trainer = make_trainer(tmp_path)
+    trainer.batches = OneBadRow()
+    with pytest.raises(UserError, match=r"step 3, batch 2: .* It comes from batch-2\.mcap, step 5\. Lower"):
+        trainer.train()
+
+
+def test_a_batch_that_is_not_finite_is_left_out_where_that_is_configured(tmp_path, make_trainer, caplog):
+    class Diverges(TinyPolicy):
+        bad = True
+
+        def loss(self, batch, rng):
+            loss, logs = super().loss(batch, rng)
+            return (loss * torch.nan if trainer.step == 2 else loss), logs
+
+    trainer = make_trainer(tmp_path, Diverges(), on_non_finite="skip")
+    trainer.train()
+    rows = read_metrics(trainer.run.metrics)
+    assert [row.get("skipped") for row in rows] == [1, None]
+    assert all(math.isfinite(row["loss"]) for row in rows)
+    assert all(tensor.isfinite().all() for tensor in trainer.policy.state_dict().values())
+    assert "Skipped at step 3, batch 2: the loss is nan" in caplog.text
+
+
+def test_too_many_skipped_batches_in_a_row_stop_the_run(tmp_path, make_trainer):
+    class Hopeless(TinyPolicy):
+        def loss(self, batch, rng):
+            loss, logs = super().loss(batch, rng)
+            return loss * torch.nan, logs
+
+    with pytest.raises(UserError, match=r"step 11, .*11 batches in a row"):
+        make_trainer(tmp_path, Hopeless(), on_non_finite="skip", steps=20).train()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_request_to_stop_saves_the_step_and_goes_on_bit_for_bit(tmp_path, make_trainer, number):
+    class Asked(TinyPolicy):
+        def loss(self, batch, rng):
+            if trainer.step == 1:
+                os.kill(os.getpid(), number)
+            return super().loss(batch, rng)
+
+    whole = make_trainer(tmp_path / "whole")
+    whole.train()
+    before = signal.getsignal(number)
+    trainer = make_trainer(tmp_path / "stopped", Asked(), save_every_s=1e9)
+    with pytest.raises(Stopped) as stop:
+        trainer.train()
+    assert stop.value.exit_code == 128 + number
+    assert signal.getsignal(number) is before
+    resumed = make_trainer(tmp_path / "stopped")
+    assert resumed.step == 2
+    resumed.train()
+    assert_same_run(whole.run, resumed.run)
+
+
+def test_weights_that_a_kill_prevented_are_saved_on_resuming(tmp_path, make_trainer):
+    make_trainer(tmp_path).train()
+    trainer = make_trainer(tmp_path)
+    for path in trainer.run.weights_directory(4).iterdir():
+        path.unlink()
+    trainer.run.weights_directory(4).rmdir()
+    assert trainer.is_finished
+    trainer.train()
+    kept = tensors_of(trainer.run.policy_weights(4))
+    assert all(torch.equal(kept[name], value) for name, value in trainer.ema.policy.state_dict().items())
 
 
 def test_closes_the_batches(tmp_path, make_trainer):

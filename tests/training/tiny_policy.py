@@ -22,6 +22,7 @@ OPTIONS = TrainingOptions(
     compile=False,
     device="cpu",
     threads=1,
+    on_non_finite="stop",
 )
 OPTIM = OptimOptions(
     lr=1e-2,
@@ -72,6 +73,9 @@ class CountedBatches:
         )
         actions = torch.from_numpy(rng.normal(size=(8, STEPS, ACTION)).astype(np.float32))
         return Batch(obs, actions, torch.ones(8, STEPS, dtype=torch.bool))
+
+    def describe(self, number: int) -> list[str]:
+        return [f"batch-{number}.mcap, step {row}" for row in range(8)]
 
     def state_dict(self) -> dict[str, Any]:
         return {"next_batch": self.next_batch}

@@ -1,0 +1,210 @@
+"""Data-parallel training: `torchrun --nproc-per-node=N -m imfvla.train ...`, gloo on CPUs and nccl on GPUs.
+
+N processes compute what one computes, each on its share of the rows of every batch:
+
+- Gradients are averaged explicitly after the backward pass. `DistributedDataParallel` would average them only where
+  its own forward is called; a loss that reaches into the policy for a Jacobian-vector product goes past it, silently.
+- Random numbers are those of the whole batch: `Shared.draws` lets whoever draws from the loss's generator draw for
+  all rows and keep those of this process, so that no generator need know of processes.
+- What follows the average (clipping, the step, the average of the weights) is done by all alike. Only process 0 writes.
+
+So the state on disk does not depend on N, and a run goes on with another N.
+"""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, fields
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.overrides import TorchFunctionMode
+
+from imfvla.errors import UserError
+from imfvla.types import Batch, Observation
+
+TIMEOUT = timedelta(days=1)  # others wait while process 0 collects demonstrations
+BUCKET = 2**24  # numbers that are averaged at once
+DRAWS = (torch.rand, torch.randn, torch.randint)
+
+
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """The one process of a training that no torchrun has started; also what several have in common with it."""
+
+    rank: int = 0
+    size: int = 1
+    local_size: int = 1  # processes on this machine
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process writes."""
+        return self.rank == 0
+
+    def share(self, batch: Batch) -> Batch:
+        """This process's rows of a batch."""
+        count = len(batch.actions) // self.size
+        return batch if self.size == 1 else rows(batch, slice(self.rank * count, (self.rank + 1) * count))
+
+    def draws(self, rng: torch.Generator, count: int) -> AbstractContextManager[Any]:
+        """Where the loss of `count` rows is computed, as those rows of the whole batch's."""
+        return nullcontext() if self.size == 1 else WholeBatchDraws(rng, count, self.rank, self.size)
+
+    def check(self, batch_size: int, compile_loss: bool) -> None:
+        """Raises UserError where a batch cannot be shared out."""
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        """Of each value over the processes."""
+        return list(values)
+
+    def highest(self, value: int) -> int:
+        """Of the values of all processes."""
+        return value
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Gradients become their mean over the processes."""
+
+    def begin_alike(self, policy: nn.Module) -> None:
+        """The weights become those of process 0."""
+
+    def first_of(self, values: Sequence[str], mine: str) -> str:
+        """The choice of process 0 among `values`."""
+        return mine
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shared(Alone):
+    """One of the processes that torchrun has started."""
+
+    def check(self, batch_size: int, compile_loss: bool) -> None:
+        if batch_size % self.size:
+            raise UserError(
+                f"training.batch_size must be a multiple of the {self.size} processes, found {batch_size}."
+            )
+        if compile_loss:
+            raise UserError(f"training.compile must be false with several processes, found {self.size}.")
+
+    def mean(self, values: Sequence[float]) -> list[float]:
+        total = torch.tensor(values, dtype=torch.float64, device=_device())
+        dist.all_reduce(total)
+        return (total / self.size).tolist()
+
+    def highest(self, value: int) -> int:
+        found = torch.tensor([value], device=_device())
+        dist.all_reduce(found, dist.ReduceOp.MAX)
+        return int(found)
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        for gradients in _buckets([p.grad for p in parameters if p.grad is not None]):
+            flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+            dist.all_reduce(flat)
+            flat /= self.size
+            for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+                gradient.copy_(mean.view_as(gradient))
+
+    def begin_alike(self, policy: nn.Module) -> None:
+        for tensor in policy.state_dict().values():
+            whole = tensor.contiguous()
+            dist.broadcast(whole, 0)
+            tensor.copy_(whole)
+
+    def first_of(self, values: Sequence[str], mine: str) -> str:
+        chosen = torch.tensor([values.index(mine)], device=_device())
+        dist.broadcast(chosen, 0)
+        return values[int(chosen)]
+
+    def wait(self) -> None:
+        self.highest(0)
+
+
+@contextmanager
+def joined_processes(device: str) -> Iterator[Alone]:
+    """The processes of this training, connected where torchrun has started several; `device` as in the options."""
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    if size == 1:
+        yield Alone()
+        return
+    on_gpu = device != "cpu" and torch.cuda.is_available()
+    if on_gpu:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    dist.init_process_group("nccl" if on_gpu else "gloo", timeout=TIMEOUT)
+    try:
+        yield Shared(dist.get_rank(), size, int(os.environ.get("LOCAL_WORLD_SIZE", size)))
+    finally:
+        dist.destroy_process_group()
+
+
+def rows(batch: Batch, chosen: slice) -> Batch:
+    """Some rows of a batch."""
+    parts = (getattr(batch.obs, field.name)[chosen] for field in fields(Observation))
+    return Batch(Observation(*parts), batch.actions[chosen], batch.valid[chosen])
+
+
+class WholeBatchDraws(TorchFunctionMode):
+    """Inside, random numbers of `count` rows are rows `rank` * `count` and on of what `size` times as many would get.
+
+    A draw is of rows where its first dimension is a multiple of `count`: the draws of an observation lie together.
+    What is drawn from `rng` is covered, and dropout, which draws from torch's own; other shapes are drawn by all
+    processes alike.
+    """
+
+    def __init__(self, rng: torch.Generator, count: int, rank: int, size: int) -> None:
+        super().__init__()
+        self.rng, self.count, self.rank, self.size = rng, count, rank, size
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in DRAWS and kwargs.get("generator") is self.rng:
+            return self._draw(func, args, kwargs)
+        if func is F.dropout:
+            return self._drop(*args, **kwargs)
+        return func(*args, **kwargs)
+
+    def _draw(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Tensor:
+        bounds, shape = (args[:-1], args[-1]) if func is torch.randint else ((), args)
+        if len(shape) == 1 and not isinstance(shape[0], int):
+            (shape,) = shape
+        whole = self._whole(shape)
+        if whole is None:
+            return func(*args, **kwargs)
+        return self._mine(func(*bounds, whole, **kwargs), shape[0])
+
+    def _drop(self, input: Tensor, p: float = 0.5, training: bool = True, inplace: bool = False) -> Tensor:
+        whole = self._whole(input.shape) if training and p > 0 else None
+        if whole is None:
+            return F.dropout(input, p, training, inplace)
+        kept = F.dropout(torch.ones(whole, dtype=input.dtype, device=input.device), p, True)
+        return input * self._mine(kept, len(input))
+
+    def _whole(self, shape: Sequence[int]) -> tuple[int, ...] | None:
+        if not shape or shape[0] == 0 or shape[0] % self.count:
+            return None
+        return (shape[0] * self.size, *shape[1:])
+
+    def _mine(self, drawn: Tensor, length: int) -> Tensor:
+        return drawn[self.rank * length : (self.rank + 1) * length]
+
+
+def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    bucket: list[Tensor] = []
+    for tensor in tensors:
+        if bucket and sum(map(Tensor.numel, bucket)) + tensor.numel() > BUCKET:
+            yield bucket
+            bucket = []
+        bucket.append(tensor)
+    if bucket:
+        yield bucket
+
+
+def _device() -> torch.device:
+    """Of small messages: nccl sends from GPUs only."""
+    return torch.device("cuda" if dist.get_backend() == "nccl" else "cpu")

@@ -1,0 +1,44 @@
+"""tools/chaos.py in short: killed and stopped work comes back to the same result; what differs is told."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from test_hostile_files import load_tool
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_killed_and_stopped_work_comes_back_to_the_same_result():
+    command = [
+        sys.executable,
+        str(ROOT / "tools" / "chaos.py"),
+        "training",
+        "collection",
+        "evaluation",
+        "stops",
+    ]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, "--kills", "3"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("3 kills") == 3
+    assert "exit codes [130, 138, 143]" in done.stdout
+
+
+def test_the_harness_tells_a_difference(tmp_path, capsys):
+    path = list(sys.path)
+    try:
+        chaos = load_tool("chaos")
+    finally:
+        sys.path[:] = path
+
+    def damage(folder, kills, rng):
+        return f"{chaos.compare({'a': 1, 'b': 2}, {'a': 1, 'b': 3})} parts"
+
+    chaos.FAULTS = {"training": damage}
+    chaos.sys.argv = ["chaos.py", "training"]
+    assert chaos.main() == 1
+    assert "FAILED: 1 of 2 parts differ: b" in capsys.readouterr().out

@@ -1,0 +1,172 @@
+"""Several processes compute what one computes: each takes its rows and their random numbers."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from tiny_policy import CountedBatches
+from torch.nn import functional as F
+
+from imfvla.composition import compose
+from imfvla.errors import UserError
+from imfvla.policy import build_policy
+from imfvla.training.logger import read_metrics
+from imfvla.training.parallel import Alone, Shared, WholeBatchDraws, rows
+from imfvla.types import Batch, Observation
+
+HERE = Path(__file__).parent
+# A process of torchrun's: trains to sys.argv[2] steps and may die at a step, the first time it gets there.
+SCRIPT = """
+import os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, sys.argv[3])
+from tiny_policy import CountedBatches, OPTIM, OPTIONS, TinyPolicy
+from imfvla.run_directory import RunDirectory
+from imfvla.training.loop import Trainer
+from imfvla.training.parallel import joined_processes
+
+class Dies(TinyPolicy):
+    def loss(self, batch, rng):
+        assert len(batch.actions) == 8 // int(os.environ.get("WORLD_SIZE", 1))
+        marker = Path(sys.argv[1] + "-died")
+        if trainer.step == int(sys.argv[4]) and trainer.processes.rank == 1 and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().loss(batch, rng)
+
+with joined_processes("cpu") as processes:
+    options = replace(OPTIONS, steps=6, log_every=1)
+    trainer = Trainer(Dies(), CountedBatches(), RunDirectory(sys.argv[1]), options, OPTIM, seed=7, description={},
+                      processes=processes)
+    if int(sys.argv[2]) < 6:
+        trainer.options = replace(options, steps=int(sys.argv[2]), checkpoints=1)
+    trainer.train()
+"""
+
+
+def torchrun(
+    tmp_path: Path, run: Path, size: int, until: int = 6, dies_at: int = -1, restarts: int = 0
+) -> None:
+    (tmp_path / "train.py").write_text(SCRIPT)
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={size}",
+        f"--max-restarts={restarts}", "--monitor-interval=0.1", str(tmp_path / "train.py"), str(run), str(until),
+        str(HERE), str(dies_at),
+    ]  # fmt: skip
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def assert_close(one: Path, other: Path) -> None:
+    tensors, expected = (load_file(run / "checkpoints/last/state.safetensors") for run in (one, other))
+    assert tensors.keys() == expected.keys()
+    for name, tensor in tensors.items():
+        torch.testing.assert_close(tensor, expected[name], rtol=1e-4, atol=1e-6)
+    curves = [[row["loss"] for row in read_metrics(run / "metrics.jsonl")] for run in (one, other)]
+    assert curves[0] == pytest.approx(curves[1], rel=1e-5)
+    assert len(curves[0]) == 6
+
+
+def test_two_processes_equal_one_go_on_as_one_and_survive_a_death(tmp_path, make_trainer):
+    """The process that dies at step 5 makes torchrun start both again; they go on from the last state."""
+    make_trainer(tmp_path / "one", steps=6, log_every=1).train()
+    torchrun(tmp_path, tmp_path / "two", size=2, dies_at=4, restarts=1)
+    assert (tmp_path / "two-died").exists()
+    assert_close(tmp_path / "two", tmp_path / "one")
+
+
+def test_what_two_processes_began_one_process_finishes(tmp_path, make_trainer):
+    make_trainer(tmp_path / "one", steps=6, log_every=1).train()
+    torchrun(tmp_path, tmp_path / "mixed", size=2, until=3)
+    resumed = make_trainer(tmp_path / "mixed", steps=6, log_every=1)
+    assert resumed.step == 3
+    resumed.train()
+    assert_close(tmp_path / "mixed", tmp_path / "one")
+
+
+@pytest.mark.parametrize("func", [torch.rand, torch.randn])
+@pytest.mark.parametrize("shape", [(6,), (2, 3), ((4, 3, 2),), (3,)])
+def test_each_process_keeps_its_rows_of_what_all_draw(func, shape):
+    def draw(mode):
+        rng = torch.Generator().manual_seed(3)
+        with WholeBatchDraws(rng, 2, *mode):
+            return func(*shape, generator=rng), torch.randint(9, (2,), generator=rng)
+
+    whole = draw((0, 1))
+    lengths = torch.empty(shape[0] if isinstance(shape[0], tuple) else shape)
+    parts = [draw((rank, 3)) for rank in range(3)]
+    if len(lengths) % 2:  # of no rows: alike for all
+        assert all(torch.equal(part[0], whole[0]) for part in parts)
+        return
+    rng = torch.Generator().manual_seed(3)
+    expected = func(3 * len(lengths), *lengths.shape[1:], generator=rng)
+    assert torch.equal(torch.cat([part[0] for part in parts]), expected)
+    assert torch.equal(torch.cat([part[1] for part in parts]), torch.randint(9, (6,), generator=rng))
+
+
+def test_dropout_is_that_of_the_whole_batch():
+    torch.manual_seed(1)
+    inputs = torch.randn(6, 5)
+    torch.manual_seed(2)
+    whole = F.dropout(inputs, 0.5)
+    parts = []
+    for rank in range(3):
+        torch.manual_seed(2)
+        with WholeBatchDraws(torch.Generator(), 2, rank, 3):
+            parts.append(torch.nn.Dropout(0.5)(inputs[2 * rank : 2 * rank + 2]))
+    assert torch.equal(torch.cat(parts), whole)
+
+
+def batch_of(count: int) -> Batch:
+    rng = torch.Generator().manual_seed(0)
+    observation = Observation(
+        images=torch.randint(256, (count, 1, 3, 3, 32, 32), dtype=torch.uint8, generator=rng),
+        state=torch.rand(count, 1, 16, generator=rng),
+        instruction=torch.ones(count, 16, dtype=torch.int64),
+    )
+    return Batch(
+        observation, torch.rand(count, 32, 16, generator=rng), torch.ones(count, 32, dtype=torch.bool)
+    )
+
+
+@pytest.mark.parametrize("generator", ["imf", "meanflow", "flow", "ddpm", "l1"])
+def test_gradients_of_shares_average_to_those_of_the_batch(generator):
+    """The loss with its derivative along the flow, taken twice on halves, is the loss of the whole."""
+    from imfvla.statistics import Statistics
+
+    torch.manual_seed(0)
+    config = compose("train", ["observation.image_size=[32,32]", f"generator={generator}"])
+    batch = batch_of(4)
+    ones = batch.actions[:, 0].numpy()
+    policy = build_policy(
+        config,
+        Statistics.of(ones, ones, batch.actions.numpy() - ones[:, None], batch.valid.numpy()),
+    )
+
+    def gradients(share: Batch, rank: int, size: int) -> dict[str, torch.Tensor]:
+        policy.zero_grad(set_to_none=True)
+        rng = torch.Generator().manual_seed(5)
+        with WholeBatchDraws(rng, len(share.actions), rank, size):
+            policy.loss(share, rng)[0].backward()
+        return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+
+    whole = gradients(batch, 0, 1)
+    halves = [gradients(rows(batch, slice(2 * rank, 2 * rank + 2)), rank, 2) for rank in range(2)]
+    assert whole.keys() == halves[0].keys()
+    for name, gradient in whole.items():
+        torch.testing.assert_close((halves[0][name] + halves[1][name]) / 2, gradient, rtol=1e-3, atol=1e-5)
+
+
+def test_a_batch_that_cannot_be_shared_out_is_refused():
+    with pytest.raises(UserError, match=r"batch_size must be a multiple of the 3 processes, found 8"):
+        Shared(0, 3, 3).check(8, compile_loss=False)
+    with pytest.raises(UserError, match=r"training\.compile must be false with several processes"):
+        Shared(0, 2, 2).check(8, compile_loss=True)
+    Alone().check(7, compile_loss=True)
+    assert len(Shared(1, 2, 2).share(next(CountedBatches())).actions) == 4
