@@ -74,12 +74,12 @@ def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
         failures = [Failure.of(error, job.config_name, " ".join(known.overrides))]
     except Stopped as stop:
         name = signal.Signals(stop.number).name
-        told = (
+        text = (
             "Interrupted."
             if stop.number == signal.SIGINT
             else f"Stopped by {name}; the same command goes on."
         )
-        print(told, file=sys.stderr)
+        print(text, file=sys.stderr)
         return stop.exit_code
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)

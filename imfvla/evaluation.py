@@ -111,6 +111,7 @@ def evaluate(
         raise UserError(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
+    run.refuse_links_outside()
     weights = run.policy_weights(checkpoint)
     if not weights.exists():
         raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")

@@ -67,6 +67,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         policy.generator.check_nfe(nfe)
     seed = config["seed"]
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
+    run.refuse_links_outside()
     with joined_processes(training.device) as processes:
         if processes.is_first:
             _run_stages(config, run, training, optim, evaluation, processes)

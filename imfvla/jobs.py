@@ -1,6 +1,7 @@
 """One job of a command, as Hydra's launchers run it, here or on another machine: a failure comes back as a value."""
 
 import errno
+import os
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,15 @@ SYSTEM_REMEDIES = {
 }
 
 
+def told(error: Exception) -> Exception:
+    """A UserError in place of one of the system's that the user can mend; any other error as it is."""
+    if not isinstance(error, OSError) or error.errno not in SYSTEM_REMEDIES:
+        return error
+    file = f" at {os.fsdecode(error.filename)}" if error.filename else ""
+    remedy = f"{SYSTEM_REMEDIES[error.errno]}; run the same command again."
+    return UserError(f"{error.strerror}{file}: {remedy}")
+
+
 @dataclass(frozen=True, slots=True)
 class Failure:
     """What is told of a job that failed: one sentence for a user's mistake, else a traceback."""
@@ -36,11 +46,7 @@ class Failure:
     def of(cls, error: Exception, config_name: str, overrides: str) -> "Failure":
         if isinstance(error, HydraException | OmegaConfBaseException):
             error = composition.explain(error, config_name, overrides.split())
-        if isinstance(error, OSError) and error.errno in SYSTEM_REMEDIES:
-            file = f" at {error.filename}" if error.filename else ""
-            error = UserError(
-                f"{error.strerror}{file}: {SYSTEM_REMEDIES[error.errno]}; run the same command again."
-            )
+        error = told(error)
         if isinstance(error, UserError):
             return cls(overrides, str(error), True)
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)

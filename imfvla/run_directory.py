@@ -105,6 +105,15 @@ class RunDirectory:
             raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
         return config
 
+    def refuse_links_outside(self) -> None:
+        """Raises UserError where a link would lead what is written here to somewhere else."""
+        home = self.path.resolve()
+        for path in self.path.rglob("*"):
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise UserError(
+                    f"{path} leads out of the run directory, to {path.resolve()}: remove that link."
+                )
+
     def training_steps(self) -> int:
         """The steps of the whole training. Raises UserError where the config does not say them."""
         return training_steps(self.config(), self.path)

@@ -1,6 +1,8 @@
 """Evaluations: equal seeds give equal bytes, a killed one goes on, a finished one is left alone."""
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -41,8 +43,10 @@ def fresh_workbench():
 
 
 def roll(run: RunDirectory, **options) -> list[dict]:
-    defaults = {"episodes": 6, "first_seed": 100_000, "nfe": [1], "workers": 0, "recordings": False}
-    return evaluate(run, build=build_fakes, **{**defaults, **options})
+    defaults = {
+        "episodes": 6, "first_seed": 100_000, "nfe": [1], "workers": 0, "recordings": False, "build": build_fakes,
+    }  # fmt: skip
+    return evaluate(run, **{**defaults, **options})
 
 
 def untimed_lines(folder: Path) -> list[str]:
@@ -241,3 +245,27 @@ def test_known_policies_are_reset_between_episodes(run):
     _, policy = workbench._bench(build_fakes, run.path, 20)
     assert isinstance(policy, KnownPolicy)
     assert [steps[0] for steps in policy.seen[:11]] == [*range(0, 40, 4), 0]
+
+
+def build_that_dies_once(run: Path, step: int) -> tuple:
+    """A `workbench.Build` whose first process is gone in the middle of its third episode."""
+    env, policy = build_fakes(run, step)
+    reset, played = env.reset, []
+
+    def dies(seed: int) -> object:
+        played.append(seed)
+        if len(played) == 3 and not (run / "died").exists():
+            (run / "died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return reset(seed)
+
+    env.reset = dies
+    return env, policy
+
+
+def test_the_episode_of_a_worker_that_died_is_played_again_and_counted(run):
+    (undisturbed,) = roll(run)
+    before = untimed_lines(run.rollouts(NAME))
+    (summary,) = roll(run, build=build_that_dies_once, workers=1, overwrite=True)
+    assert untimed_lines(run.rollouts(NAME)) == before
+    assert (undisturbed["worker_incidents"], summary["worker_incidents"]) == (0, 1)

@@ -1,4 +1,5 @@
 import os
+import threading
 
 import pytest
 
@@ -54,3 +55,13 @@ def test_an_unknown_backend_is_named(clean):
     clean.setenv("MUJOCO_GL", "vulkan")
     with pytest.raises(UserError, match=r"MUJOCO_GL must be one of egl, osmesa.*found 'vulkan'"):
         gl.select_gl_backend()
+
+
+def test_a_driver_that_hangs_is_one_that_is_not_there(clean):
+    waiting = threading.Event()
+    clean.setattr(gl, "PROBE_TIMEOUT_S", 0.01)
+    clean.setattr(gl, "_PROBES", {"egl": waiting.wait, "osmesa": lambda: True})
+    try:
+        assert gl.select_gl_backend() == "osmesa"
+    finally:
+        waiting.set()

@@ -15,6 +15,7 @@ from synthetic import write_episode
 from imfvla.composition import compose, run_name
 from imfvla.construction import construct, refuse_foreign_target
 from imfvla.errors import UserError
+from imfvla.experiment import run_experiment
 from imfvla.policy import build_policy
 from imfvla.recording import McapSink, read_episode
 from imfvla.run_directory import RunDirectory
@@ -216,3 +217,18 @@ def test_an_attachment_is_read_and_never_written(fuzz, tmp_path):
         read_episode(tmp_path / "a.mcap")  # its checksum is of the old name
     assert [path.name for path in tmp_path.rglob("*")] == ["a.mcap"]
     assert McapSink(tmp_path / "b.mcap").path.parent == tmp_path
+
+
+@pytest.mark.parametrize("link", [".lock", "metrics.jsonl", "rollouts", "checkpoints/last"])
+def test_a_link_that_leads_out_of_a_run_directory_is_refused(tmp_path, link):
+    run = RunDirectory(tmp_path / "run")
+    (run.path / link).parent.mkdir(parents=True)
+    (run.path / "here").symlink_to(run.path / "status.json")
+    run.refuse_links_outside()
+    (tmp_path / "precious").write_text("of the user")
+    (run.path / link).symlink_to(tmp_path / "precious")
+    with pytest.raises(UserError, match="leads out of the run directory"):
+        run.refuse_links_outside()
+    with pytest.raises(UserError, match="leads out of the run directory"):
+        run_experiment(compose("train", ["observation.image_size=[32,32]"]), run)
+    assert (tmp_path / "precious").read_text() == "of the user"

@@ -40,6 +40,7 @@ from imfvla import collection, workbench
 from imfvla.episode import Decision
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
+from imfvla.jobs import told
 from imfvla.recording import read_episode
 from imfvla.reporting.metrics import untimed
 from imfvla.run_directory import RunDirectory
@@ -182,11 +183,11 @@ def start(work: Work, folder: Path) -> int:
         code = 0
     except Stopped as stop:
         code = stop.exit_code
-    except UserError as error:
-        print(error, file=sys.stderr, flush=True)
-        code = 2
-    except BaseException as error:
-        print(repr(error), file=sys.stderr, flush=True)
+    except Exception as error:  # as the entry points tell it
+        found = told(error)
+        is_users = isinstance(found, UserError)
+        print(found if is_users else repr(found), file=sys.stderr, flush=True)
+        code = 2 if is_users else 1
     os._exit(code)
 
 
@@ -221,7 +222,8 @@ def kill_over(work: Work, folder: Path, kills: int, amount: int, rng: random.Ran
     done = during_write = 0
     while True:
         child, began_at = start(work, folder), progress_of(folder)
-        goal = began_at + rng.randint(0, max(0, 2 * (amount - began_at) // max(1, kills - done) - 1))
+        left = int(0.9 * amount) - began_at  # so that the last kill does not come after the end
+        goal = began_at + rng.randint(0, max(0, 2 * left // max(1, kills - done) - 1))
         while (code := ended(child)) is None:
             if done < kills and progress_of(folder) >= goal:
                 deadline = time.monotonic() + 2.0
@@ -312,7 +314,7 @@ def train_saving_rarely(folder: Path, steps: int) -> None:
 
 def disk(folder: Path, kills: int, rng: random.Random) -> str:
     """A full disk, a read-only one, no file handles: an error that says so, the last state whole, then it goes on."""
-    work = partial(train, steps=40)
+    work = partial(train, steps=200)
     undisturbed(work, folder / "whole")
     mounted = folder / "small"
     mounted.mkdir()
@@ -322,11 +324,8 @@ def disk(folder: Path, kills: int, rng: random.Random) -> str:
     said = {}
     try:
         target = mounted / "run"
-        kill_over(work, target, 1, 10, rng)
-        for path in (target, Path(f"{target}.log")):
-            subprocess.run(["rm", "-rf", str(path)], check=True)
         child = start(work, target)
-        while progress_of(target) < 8:
+        while progress_of(target) < 8 and ended_or_late(child, time.monotonic() + 60):
             time.sleep(POLL_S)
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
@@ -350,8 +349,11 @@ def disk(folder: Path, kills: int, rng: random.Random) -> str:
 
 
 def without_handles(work: Work, folder: Path) -> None:
-    used = len(os.listdir("/proc/self/fd"))
-    resource.setrlimit(resource.RLIMIT_NOFILE, (used + 1, used + 1))
+    """Leaves two handles: enough to open the logs, too few to save beside them."""
+    highest = max(map(int, os.listdir("/proc/self/fd")))
+    while os.dup(0) <= highest:  # fills the gaps
+        pass
+    resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 4, highest + 4))
     work(folder)
 
 
@@ -363,7 +365,7 @@ def fails(work: Work, folder: Path, number: int) -> str:
         link.unlink(missing_ok=True)
         link.symlink_to(log)
     code = os.waitstatus_to_exitcode(os.waitpid(start_logging(work, folder, log), 0)[1])
-    words = log.read_text().strip().splitlines()[-1] if log.exists() else ""
+    words = "".join(log.read_text().strip().splitlines()[-1:]) if log.exists() else ""
     if code != 2 or os.strerror(number) not in words:
         raise Differs(f"wanted exit code 2 and {os.strerror(number)!r}, found {code}: {words!r}")
     read_tensors(RunDirectory(folder).last_state)
@@ -438,6 +440,8 @@ def main() -> int:
     if unknown := set(options.what) - FAULTS.keys():
         parser.error(f"no {', '.join(unknown)}; there are {', '.join(FAULTS)}")
     torch.set_num_threads(1)  # before the first fork: threads do not survive one
+    with tempfile.TemporaryDirectory(prefix="imfvla-chaos-") as folder:
+        train(Path(folder), steps=4)  # what is imported and looked up once is there in every process
     failed = 0
     for what in options.what or FAULTS:
         with tempfile.TemporaryDirectory(prefix="imfvla-chaos-") as folder:

@@ -3,6 +3,7 @@
 Loading is strict: a missing, foreign or misshapen tensor is an error that names it.
 """
 
+import errno
 import json
 import shutil
 from collections.abc import Mapping
@@ -143,10 +144,16 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            raise  # the file is well, the machine is not
+        raise _damaged(path, error) from error
     except Exception as error:  # a damaged header can surface as anything, from SafetensorError to KeyError
-        raise UserError(
-            f"{path} is cut off or damaged ({error}): restore it, or delete it and train again."
-        ) from error
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    return UserError(f"{path} is cut off or damaged ({error}): restore it, or delete it and train again.")
 
 
 def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:

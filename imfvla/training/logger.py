@@ -26,7 +26,8 @@ class MetricsLogger:
         with clear_write_errors(self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115
-        self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
+        with clear_write_errors(run.tensorboard):
+            self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
         self._sums: dict[str, float] = dict(state["sums"]) if state else {}
         self._count: int = state["count"] if state else 0
         self._skipped: int = state.get("skipped", 0) if state else 0

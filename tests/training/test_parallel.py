@@ -22,11 +22,13 @@ HERE = Path(__file__).parent
 # A process of torchrun's: trains to sys.argv[2] steps and may die at a step, the first time it gets there.
 SCRIPT = """
 import os, signal, sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from tiny_policy import CountedBatches, OPTIM, OPTIONS, TinyPolicy
 from imfvla.run_directory import RunDirectory
+from imfvla.signals import Stopped
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import joined_processes
 
@@ -37,15 +39,16 @@ class Dies(TinyPolicy):
         if trainer.step == int(sys.argv[4]) and trainer.processes.rank == 1 and not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
+        if trainer.step == int(sys.argv[2]) - 1 < 5 and trainer.processes.rank == 1:
+            os.kill(os.getpid(), signal.SIGTERM)  # one is asked, all stop after the same step
         return super().loss(batch, rng)
 
 with joined_processes("cpu") as processes:
     options = replace(OPTIONS, steps=6, log_every=1)
     trainer = Trainer(Dies(), CountedBatches(), RunDirectory(sys.argv[1]), options, OPTIM, seed=7, description={},
                       processes=processes)
-    if int(sys.argv[2]) < 6:
-        trainer.options = replace(options, steps=int(sys.argv[2]), checkpoints=1)
-    trainer.train()
+    with suppress(Stopped):
+        trainer.train()
 """
 
 
