@@ -66,9 +66,9 @@ class Differs(Exception):
 # --- the work -------------------------------------------------------------------------------------------------------
 
 
-def train(folder: Path, steps: int) -> None:
-    """A whole training, a state after every step."""
-    options = replace(OPTIONS, steps=steps, log_every=1, checkpoints=4)
+def train(folder: Path, steps: int, save_every_s: float = 0.0) -> None:
+    """A whole training, by default with a state after every step."""
+    options = replace(OPTIONS, steps=steps, log_every=1, checkpoints=4, save_every_s=save_every_s)
     Trainer(
         TinyPolicy(), CountedBatches(), RunDirectory(folder), options, OPTIM, seed=7, description={}
     ).train()
@@ -188,7 +188,8 @@ def start(work: Work, folder: Path) -> int:
         is_users = isinstance(found, UserError)
         print(found if is_users else repr(found), file=sys.stderr, flush=True)
         code = 2 if is_users else 1
-    os._exit(code)
+    finally:
+        os._exit(code)
 
 
 def ended(child: int) -> int | None:
@@ -280,7 +281,7 @@ def kills_of(work: Work, leaves: Callable[[Path], dict[str, Any]], amount: int) 
 def stops(folder: Path, kills: int, rng: random.Random) -> str:
     """Signals that ask to stop: the state of the step is saved, the exit code says which it was."""
     work = partial(train, steps=120)
-    rarely = partial(train_saving_rarely, steps=120)
+    rarely = partial(train, steps=120, save_every_s=1e9)
     undisturbed(work, folder / "whole")
     slowest, codes = 0.0, set()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
@@ -303,13 +304,6 @@ def stops(folder: Path, kills: int, rng: random.Random) -> str:
     undisturbed(work, folder / "stopped")
     equal = compare(state_of(folder / "stopped"), state_of(folder / "whole"))
     return f"{turn + 1} stops, exit codes {sorted(codes)}, at most {slowest:.1f} s; {equal} parts equal bit for bit"
-
-
-def train_saving_rarely(folder: Path, steps: int) -> None:
-    options = replace(OPTIONS, steps=steps, log_every=1, checkpoints=4, save_every_s=1e9)
-    Trainer(
-        TinyPolicy(), CountedBatches(), RunDirectory(folder), options, OPTIM, seed=7, description={}
-    ).train()
 
 
 def disk(folder: Path, kills: int, rng: random.Random) -> str:
