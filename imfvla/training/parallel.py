@@ -134,9 +134,16 @@ def joined_processes(device: str) -> Iterator[Alone]:
     on_gpu = device != "cpu" and torch.cuda.is_available()
     if on_gpu:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("nccl" if on_gpu else "gloo", timeout=TIMEOUT)
+    local_size = int(os.environ.get("LOCAL_WORLD_SIZE", size))
+    store, rank, _ = next(dist.rendezvous("env://", timeout=TIMEOUT))
+    if local_size == size:
+        # torchrun keeps its store over a restart, and with it the addresses of the processes that are gone. On
+        # several machines the number of restarts is not common knowledge; docs/reliability.md says what to do there.
+        store = dist.PrefixStore(f"restart {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+    backend = "nccl" if on_gpu else "gloo"
+    dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
     try:
-        yield Shared(dist.get_rank(), size, int(os.environ.get("LOCAL_WORLD_SIZE", size)))
+        yield Shared(rank, size, local_size)
     finally:
         dist.destroy_process_group()
 
