@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from imfvla.documents import read_json
+from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
 from imfvla.figures.style import GREY, INK, new_figure, style
 
@@ -21,12 +21,10 @@ def read_depth_attention(run: Path) -> dict[str, Any] | None:
         return None
     remedy = f"delete it or repeat python tools/depth_attention.py {run}"
     try:
-        found = read_json(path, remedy, mapping=True)
+        found = parse_json(read_text(path, MAX_JSON_BYTES))
         _matrix(found["actions"])
         found["experiment"], found["checkpoint_step"]
-    except UserError:
-        raise
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
         raise UserError(f"{path} holds no depth weights: {error!r}; {remedy}.") from error
     return found
 
