@@ -44,7 +44,7 @@ def depth_attention(recorded: Sequence[Mapping[str, Any]]) -> Figure:
             np.nanmax(weights[1:], initial=0.1) for weights in matrices
         )  # the first row has one source
         for axis, found, weights in zip(axes, recorded, matrices, strict=True):
-            image = axis.imshow(weights, cmap="cividis", vmin=0, vmax=brightest)
+            image = axis.imshow(weights, cmap="cividis", vmin=0, vmax=brightest, aspect="auto")
             axis.set_title(f"{found['experiment']}, step {found['checkpoint_step']}")
             axis.grid(visible=False)
             axis.set_xlabel("source")
