@@ -53,6 +53,7 @@ class ExpertOptions:
 
     modes: int
     noise: float
+    hold: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ class Settings:
     variant: str
     modes: int
     noise: float
+    hold: int
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -205,7 +207,7 @@ def _stage_for(settings: Settings) -> tuple[Any, Any]:
     env = tasks.load(
         settings.task, variant=settings.variant, image_size=settings.image_size, views=settings.views
     )
-    return env, make_expert(settings.task, modes=settings.modes, noise=settings.noise)
+    return env, make_expert(settings.task, modes=settings.modes, noise=settings.noise, hold=settings.hold)
 
 
 class _Log:

@@ -54,8 +54,7 @@ def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[
     """A seed whose hidden draw differs from the unimodal expert's choice, and both experts."""
     from imfvla.tasks.experts import make_expert
 
-    noise = task["expert"]["noise"]
-    usual, other = (make_expert(task["name"], modes=modes, noise=noise) for modes in (1, 2))
+    usual, other = (make_expert(task["name"], **{**task["expert"], "modes": modes}) for modes in (1, 2))
     while True:
         env.reset(seed)
         usual.reset(env, seed)

@@ -10,7 +10,7 @@ from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.recording import episode_is_complete, read_episode
 
-TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002}}
+TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002, "hold": 18}}
 OBSERVATION = {"views": ["front", "r_wrist"], "image_size": [24, 32]}
 
 
@@ -94,7 +94,7 @@ def test_fewer_than_there_are_come_as_links(recorded):
 def test_a_folder_of_other_settings_is_refused_and_kept(recorded):
     before = files(recorded.directory)
     for task, observation in (
-        ({**TASK, "expert": {"modes": 2, "noise": 0.01}}, OBSERVATION),
+        ({**TASK, "expert": {"modes": 2, "noise": 0.01, "hold": 18}}, OBSERVATION),
         (TASK, {**OBSERVATION, "views": ["front"]}),
     ):
         with pytest.raises(UserError, match=r"was recorded with (noise|views)=.* is wanted; choose another"):

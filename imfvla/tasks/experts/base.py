@@ -24,7 +24,6 @@ FREE_DISTANCE, LEAST_FREEDOM = (
     0.08,
     0.2,
 )  # full noise this far [m] from the goal, this share of it at the goal
-HOLD_STEPS = 18  # after success, before a demonstration ends
 _STYLE_STREAM, _NOISE_STREAM = 11, 12
 _ARM = {"left": slice(0, 7), "right": slice(8, 15)}
 _GRIPPER = {"left": 7, "right": 15}
@@ -76,16 +75,19 @@ class Expert:
         modes: 1 each gripper turns the same way in every episode; 2 the right one's way is drawn from the seed;
             4 both are drawn, independently. Nothing in the observation shows what was drawn.
         noise: standard deviation [rad] of the joint noise that is executed but not recorded as action.
+        hold: control steps for which a demonstration goes on after success, so that holding is shown too.
     """
 
     task_name: str
 
-    def __init__(self, *, modes: int, noise: float) -> None:
+    def __init__(self, *, modes: int, noise: float, hold: int) -> None:
         if modes not in (1, 2, 4):
             raise UserError(f"task.expert.modes must be 1, 2 or 4, found {modes!r}.")
         if not 0 <= noise <= 0.05:
             raise UserError(f"task.expert.noise is a joint angle [rad] from 0 to 0.05, found {noise!r}.")
-        self.modes, self.noise = modes, noise
+        if hold < 1:
+            raise UserError(f"task.expert.hold is a number of control steps, at least 1, found {hold!r}.")
+        self.modes, self.noise, self.hold = modes, noise, hold
         self.style: dict[str, Any] = {}
         self.hands: dict[str, Hand] = {}
 
@@ -145,7 +147,7 @@ class Expert:
         """Whether success has been held long enough to end the demonstration; to be asked once after each step."""
         if self._steps_since_success >= 0 or env.stage() >= env.success_stage:
             self._steps_since_success += 1
-        return self._steps_since_success >= HOLD_STEPS
+        return self._steps_since_success >= self.hold
 
     def pick(self, hand: Hand, thing: Pose, grasp: np.ndarray) -> Pose:
         """Commands the approach to the point `grasp` (3,) of a thing on the table and the closing of the gripper.

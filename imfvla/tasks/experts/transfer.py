@@ -10,6 +10,7 @@ from imfvla.tasks.kinematics import about_z, rotation_vector
 
 ABOVE = 0.07  # where the left hand waits above the bar
 TAKE_SPEED = 0.12  # m/s
+RETREAT = np.array([0.03, 0, 0.07])  # of the right hand from where it gave the bar
 
 
 class TransferExpert(Expert):
@@ -53,9 +54,9 @@ class TransferExpert(Expert):
             right.move(right.carry(bar, goal), 0.0, self.speed)
         elif left_has and raised:
             free = right.opening > 0.6
-            retreat = right.pose.position + np.array([0.04, 0, 0.08])
-            goal = Pose(retreat if free else right.pose.position, right.pose.rotation)
-            right.move(goal, 1.0, self.speed)
+            gave = self.meeting + np.array([self.give_at, 0, 0])
+            rest = Pose(gave + RETREAT, about_z(self.turn["right"] * np.pi / 2))
+            right.move(rest if free else right.pose, 1.0, self.speed)
         else:
             self.pick(right, bar, np.array([self.give_at, 0, 0]))
 
