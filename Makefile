@@ -17,7 +17,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations bench tables report gallery test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations campaign bench tables report gallery test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
@@ -47,6 +47,9 @@ sweep-evaluations:  ## Evaluate with 1 to 10 flow evaluations
 sweep-demonstrations:  ## Train on 25 to 200 demonstrations
 sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations: sweep-%: setup
 	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
+
+campaign: setup  ## Train, evaluate and keep every policy of Tables 1 and 2 and the controls (ARGS="--side-by-side 2")
+	$(PY) tools/campaign.py $(ARGS)
 
 bench: setup  ## Measure sizes, simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)

@@ -6,7 +6,15 @@ from typing import Any
 
 from imfvla.errors import UserError
 from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import DONE, EXECUTION_KEYS, RunDirectory, differences, plain
+from imfvla.run_directory import (
+    DONE,
+    EXECUTION_KEYS,
+    RunDirectory,
+    differences,
+    plain,
+    share_of,
+    training_steps,
+)
 
 PROTOCOL_KEYS = (
     "first_seed",
@@ -21,21 +29,34 @@ def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
 
     False where its files cannot be read: running it then says why.
     """
-    run = RunDirectory(directory)
     try:
-        if run.status().get("state") != DONE:
-            return False
-        found = run.config()
-        if differences(found, plain(config), EXECUTION_KEYS):
-            return False
-        wanted = config["evaluation"]
-        step = int(run.policy_weights(wanted["checkpoint"]).parent.name.removeprefix("step-"))
-        protocol = {key: wanted[key] for key in PROTOCOL_KEYS} | {"checkpoint_step": step, "max_steps": None}
-        of_protocol = [
-            evaluation
-            for evaluation in evaluations(run, found)
-            if protocol.items() <= evaluation.summary["protocol"].items()
-        ]
-        return {*wanted["nfe"]} <= {evaluation.nfe for evaluation in of_protocol}
+        weights = RunDirectory(directory).policy_weights(config["evaluation"]["checkpoint"])
+        return _has_evaluations(config, directory, int(weights.parent.name.removeprefix("step-")))
     except (UserError, TypeError, KeyError):
         return False
+
+
+def is_reported(config: Mapping[str, Any], directory: Path) -> bool:
+    """The same of a result, which has no weights."""
+    try:
+        steps = training_steps(config, directory)
+        return _has_evaluations(config, directory, share_of(steps, config["evaluation"]["checkpoint"]))
+    except (UserError, TypeError, KeyError):
+        return False
+
+
+def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> bool:
+    run = RunDirectory(directory)
+    if run.status().get("state") != DONE:
+        return False
+    found = run.config()
+    if differences(found, plain(config), EXECUTION_KEYS):
+        return False
+    wanted = config["evaluation"]
+    protocol = {key: wanted[key] for key in PROTOCOL_KEYS} | {"checkpoint_step": step, "max_steps": None}
+    of_protocol = [
+        evaluation
+        for evaluation in evaluations(run, found)
+        if protocol.items() <= evaluation.summary["protocol"].items()
+    ]
+    return {*wanted["nfe"]} <= {evaluation.nfe for evaluation in of_protocol}

@@ -25,6 +25,9 @@ from imfvla.errors import UserError
 from imfvla.files import write_json, write_text
 
 RUNNING, DONE, FAILED = "running", "done", "failed"
+LAST = (
+    "last"  # of the weights that are kept; others are named by a step, or a share of the training such as 1/3
+)
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
     "evaluation",
@@ -73,7 +76,7 @@ class RunDirectory:
         found = (re.fullmatch(r"step-(\d+)", path.name) for path in self.checkpoints.glob("step-*"))
         return sorted(int(match.group(1)) for match in found if match)
 
-    def policy_weights(self, step: int | str = "last") -> Path:
+    def policy_weights(self, step: int | str = LAST) -> Path:
         """`policy.safetensors` of a step, of the last one kept, or of a share of the training such as "1/3".
 
         Raises UserError where there is none.
@@ -83,10 +86,10 @@ class RunDirectory:
             raise UserError(
                 f"{self.path} has no weights in checkpoints/step-*: wanted a run that has trained."
             )
-        if step == "last":
+        if step == LAST:
             step = steps[-1]
         elif re.fullmatch(r"[1-9]\d*/[1-9]\d*", str(step)):
-            step = round(self.training_steps() * Fraction(step))
+            step = share_of(self.training_steps(), str(step))
         if step not in steps:
             kept = ", ".join(str(known) for known in steps)
             raise UserError(
@@ -173,6 +176,11 @@ def training_steps(config: Mapping[str, Any], run: Path) -> int:
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
         raise UserError(f"{run}/config.yaml must have training.steps of at least 1, found {steps!r}.")
     return steps
+
+
+def share_of(steps: int, checkpoint: str) -> int:
+    """The step of the last weights, or of those of a share such as "1/3", in a training of so many steps."""
+    return steps if checkpoint == LAST else round(steps * Fraction(checkpoint))
 
 
 def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:

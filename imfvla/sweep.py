@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 class SweepOptions:
     """A file of conf/sweep."""
 
-    table: int | None  # all rows of this table of the paper that a run answers
+    tables: tuple[int, ...]  # of the paper: all their rows that a run answers
     jobs: tuple[
         tuple[str, ...], ...
     ]  # overrides; commas and ranges in one give every combination, as with -m
@@ -75,17 +75,32 @@ def run_sweep(job: Job, overrides: Sequence[str], is_finished: IsFinished | None
     Raises:
       UserError, HydraException: a job that cannot be composed, before any runs.
     """
-    directory = str(composition.config_directory())
-    with initialize_config_dir(directory, version_base=composition.VERSION_BASE, job_name=job.config_name):
-        hydra = GlobalHydra.instance().hydra
-        common = [text for text in overrides if composition.key_of(text) != GROUP]
-        chosen = [text for text in overrides if composition.key_of(text) == GROUP]
-        master = hydra.compose_config(job.config_name, common, RunMode.MULTIRUN, with_log_configuration=True)
-        context = HydraContext(config_loader=hydra.config_loader, callbacks=Callbacks(master))
-        planned = plan(hydra.config_loader, master, chosen)
+    with _composed(job.config_name, overrides, with_log_configuration=True) as (loader, master, chosen):
+        context = HydraContext(config_loader=loader, callbacks=Callbacks(master))
+        planned = plan(loader, master, chosen)
         launcher = Plugins.instance().instantiate_launcher(context, job, master)
         is_here = master.hydra.launcher._target_ == f"{BasicLauncher.__module__}.{BasicLauncher.__qualname__}"
         return _Sweep(launcher, is_here, job.config_name, is_finished).run(planned)
+
+
+def planned_jobs(config_name: str, overrides: Sequence[str]) -> list[Planned]:
+    """The jobs that `run_sweep` would look at, in its order; raises as it does."""
+    with _composed(config_name, overrides, with_log_configuration=False) as (loader, master, chosen):
+        return plan(loader, master, chosen)
+
+
+@contextmanager
+def _composed(
+    config_name: str, overrides: Sequence[str], with_log_configuration: bool
+) -> Iterator[tuple[ConfigLoader, DictConfig, list[str]]]:
+    """Hydra's loader, the config that all jobs have in common, and the overrides that name sweeps."""
+    directory = str(composition.config_directory())
+    with initialize_config_dir(directory, version_base=composition.VERSION_BASE, job_name=config_name):
+        hydra = GlobalHydra.instance().hydra
+        common = [text for text in overrides if composition.key_of(text) != GROUP]
+        chosen = [text for text in overrides if composition.key_of(text) == GROUP]
+        master = hydra.compose_config(config_name, common, RunMode.MULTIRUN, with_log_configuration)
+        yield hydra.config_loader, master, chosen
 
 
 def plan(loader: ConfigLoader, master: DictConfig, chosen: Sequence[str]) -> list[Planned]:
@@ -207,8 +222,8 @@ def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tup
     config = loader.load_configuration(config_name, [f"+{GROUP}={name}"], RunMode.RUN)
     where = f"conf/{GROUP}/{name}.yaml"
     read = build(SweepOptions, OmegaConf.to_container(config[GROUP]), where)
-    require(read.table is None or read.table in TABLES, f"{where}: table", "null, 1 or 2", read.table)
-    rows = read_mapping().of_table(read.table) if read.table else ()
+    require({*read.tables} <= {*TABLES}, f"{where}: tables", "a list of 1 and 2", read.tables)
+    rows = [row for table in read.tables for row in read_mapping().of_table(table)]
     return [*jobs_of_rows(rows), *read.jobs]
 
 

@@ -76,6 +76,7 @@ def write_evaluation(
     suffix += "".join(f"_{key}{value}" for key, value in protocol.items())
     folder = run / "rollouts" / f"seeds{seeds[0]}-{seeds[1]}_nfe{nfe}{suffix}"
     folder.mkdir(parents=True, exist_ok=True)
+    summary["name"] = folder.name
     (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return folder

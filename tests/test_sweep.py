@@ -11,11 +11,11 @@ import tiny_sweep
 from imfvla.completion import is_complete
 from imfvla.composition import CONFIG_DIRECTORY, run_name
 from imfvla.reporting.answers import Sources
-from imfvla.reporting.mapping import LAST, read_mapping
+from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import untimed
 from imfvla.reporting.results import Result
 from imfvla.reporting.tables import other_table
-from imfvla.run_directory import DONE, RunDirectory
+from imfvla.run_directory import DONE, LAST, RunDirectory
 from imfvla.sweep import Planned, _Sweep, jobs_of_rows, waves
 
 MAPPING = read_mapping()

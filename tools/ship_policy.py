@@ -10,69 +10,12 @@ curves stay behind, and with --without-weights, for a result that the tables are
 
 import argparse
 import json
-import shutil
 import sys
 from pathlib import Path
 
-from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.files import write_json, write_text
-from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import DONE, RunDirectory
-
-MAX_BYTES = 8_000_000  # of the weights
-THINNING = 10
-
-
-def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
-    """Fills `target`, which must not be there yet, and returns what made_by.json says.
-
-    Raises UserError for an unfinished run, weights above 8 MB, no reported evaluation, or a target that exists.
-    """
-    if target.exists():
-        raise UserError(f"{target} is there already: remove it first.")
-    state = run.status().get("state")
-    if state != DONE:
-        raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
-    weights = run.policy_weights("last")
-    size = weights.stat().st_size
-    if with_weights and size > MAX_BYTES:
-        raise UserError(f"{weights} has {size} bytes: wanted at most {MAX_BYTES}; train a narrower core.")
-    reported = [evaluation for evaluation in evaluations(run) if evaluation.is_reporting]
-    if not reported:
-        raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
-    made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
-    target.mkdir(parents=True)
-    if with_weights:
-        shutil.copytree(weights.parent, target / weights.parent.relative_to(run.path))
-    for name in ("config.yaml", "status.json"):
-        shutil.copy2(run.path / name, target / name)
-    rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
-    write_text(target / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
-    for evaluation in reported:
-        folder = target / evaluation.folder.relative_to(run.path)
-        folder.mkdir(parents=True)
-        for name in ("episodes.jsonl", "summary.json"):
-            shutil.copy2(evaluation.folder / name, folder / name)
-    write_json(target / "made_by.json", made_by)
-    return made_by
-
-
-def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
-    """Command, commit, seed and results of a run."""
-    config = run.config()
-    made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
-    overrides = "" if run.path.name == "default" else " " + run.path.name.replace(",", " ")
-    shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
-    return {
-        "command": f"python -m imfvla.train +exp={config['name']}{overrides}",
-        "seed": config["seed"],
-        "code": made["fingerprint"]["code"],
-        "steps": made["step"],
-        "train_s": made["train_s"],
-        "machine": made["fingerprint"]["machine"],
-        "results": {s["name"]: {key: s[key] for key in shown} for s in summaries},
-    }
+from imfvla.run_directory import RunDirectory
+from imfvla.shipping import ship
 
 
 def main() -> int:

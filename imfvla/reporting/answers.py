@@ -9,10 +9,10 @@ from typing import Any
 
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import REMEDY, read_episodes
-from imfvla.reporting.mapping import LAST, Mapping, TableRow, Wanted
+from imfvla.reporting.mapping import Mapping, TableRow, Wanted
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
-from imfvla.run_directory import EXECUTION_KEYS, RunDirectory, differences, training_steps
+from imfvla.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
 
 PROTOCOL = ("task", "variant", "noise_seed", "first_seed", "episodes", "max_steps", "device")
 

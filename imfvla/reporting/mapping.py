@@ -20,9 +20,9 @@ from imfvla.reporting.paper import (
     paper_comparisons,
     paper_rows,
 )
+from imfvla.run_directory import LAST, share_of
 
 PATH = Path(__file__).resolve().parents[2] / "experiments" / "tables.yaml"
-LAST = "last"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
 _LINE = "__line__"
@@ -65,7 +65,7 @@ class TableRow:
 
     def step(self, steps: int) -> int:
         """The step of the row's weights in a training of so many steps."""
-        return steps if self.checkpoint == LAST else round(steps * Fraction(self.checkpoint))
+        return share_of(steps, self.checkpoint)
 
 
 @dataclass(frozen=True, slots=True)

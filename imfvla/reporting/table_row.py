@@ -7,12 +7,11 @@ from typing import Any
 from rich.console import Console
 
 from imfvla.files import write_json, write_text
-from imfvla.reporting.mapping import LAST
 from imfvla.reporting.metrics import wilson_interval
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.runs import METRICS, Evaluation, evaluations, rows
 from imfvla.reporting.table import NOTHING, Table, number
-from imfvla.run_directory import RunDirectory
+from imfvla.run_directory import LAST, RunDirectory
 
 COLUMNS = (
     "nfe", "source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "95% interval",

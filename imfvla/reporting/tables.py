@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping import LAST, Comparison
+from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import TITLES, PaperRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
+from imfvla.run_directory import LAST
 
 COLUMNS = (
     "Row", "nfe", "Source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "Latency ms", "p95 ms",

@@ -1,7 +1,6 @@
 """A finished run becomes a small directory that says what made it."""
 
 import json
-import runpy
 from pathlib import Path
 
 import pytest
@@ -11,8 +10,8 @@ from imfvla.errors import UserError
 from imfvla.files import write_json
 from imfvla.reporting.metrics import summarise
 from imfvla.run_directory import DONE, RUNNING, RunDirectory
+from imfvla.shipping import ship
 
-TOOL = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "ship_policy.py"))
 EPISODE = {
     "total_reward": 900.0,
     "num_steps": 700,
@@ -59,7 +58,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
 
 def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     run = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "training.steps=20")
-    made_by = TOOL["ship"](run, tmp_path / "shipped")
+    made_by = ship(run, tmp_path / "shipped")
     files = {str(path.relative_to(tmp_path / "shipped")) for path in (tmp_path / "shipped").rglob("*.*")}
     assert {path for path in files if "." in Path(path).name} == {
         "config.yaml",
@@ -79,7 +78,7 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
 
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
     run = make_run(tmp_path / "run", size=8_000_001)
-    TOOL["ship"](run, tmp_path / "results", with_weights=False)
+    ship(run, tmp_path / "results", with_weights=False)
     assert not list(tmp_path.glob("results/**/*.safetensors"))
     assert (tmp_path / "results" / "rollouts" / "reported" / "episodes.jsonl").is_file()
 
@@ -95,11 +94,11 @@ def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
 def test_what_may_not_be_shipped_is_refused_and_nothing_is_written(tmp_path, changes, reason):
     run = make_run(tmp_path / "run", **changes)
     with pytest.raises(UserError, match=reason):
-        TOOL["ship"](run, tmp_path / "shipped")
+        ship(run, tmp_path / "shipped")
     assert not (tmp_path / "shipped").exists()
 
 
 def test_a_shipped_policy_is_not_overwritten(tmp_path):
     (tmp_path / "shipped").mkdir()
     with pytest.raises(UserError, match="is there already"):
-        TOOL["ship"](make_run(tmp_path / "run"), tmp_path / "shipped")
+        ship(make_run(tmp_path / "run"), tmp_path / "shipped")
