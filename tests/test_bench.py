@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from fakes import FakeEnvironment
@@ -111,14 +112,19 @@ def test_a_sampler_that_wastes_time_is_told():
 
 def test_speeds_are_compared_as_the_paper_s_table_3_does():
     latencies = {
-        "socket_ph32_exec16": {"infer2": {"median_ms": 2.0}, "infer3": {"median_ms": 3.0}},
-        "socket_ddpm_ph16": {"infer100": {"median_ms": 50.0}},
+        "socket_ph32_exec16": {
+            "infer2": {"median_ms": 2.0, "log_error": 0.03},
+            "infer3": {"median_ms": 3.0, "log_error": 0.0},
+        },
+        "socket_ddpm_ph16": {"infer100": {"median_ms": 50.0, "log_error": 0.04}},
     }
     ratios = speed_ratios(read_mapping().comparisons, latencies)
     assert {label: (row["ratio"], row["paper"]) for label, row in ratios.items()} == {
         "Socket iMF infer2 vs ph16 diffusion, Latency reduction": (25.0, "23.48×"),
         "Socket iMF infer3 vs ph16 diffusion, Inference FPS": (pytest.approx(50 / 3), "22.97×"),
     }
+    latency = ratios["Socket iMF infer2 vs ph16 diffusion, Latency reduction"]
+    assert np.log([latency["low"] / 25, latency["high"] / 25]) == pytest.approx([-1.96 * 0.05, 1.96 * 0.05])
 
 
 def test_functions_are_timed_in_turn_after_the_warm_up():

@@ -11,6 +11,7 @@ from imfvla.benchmarks.clock import threads, times_ms
 from imfvla.benchmarks.sizes import core_inputs
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
+from imfvla.reporting.bootstrap import bootstrap
 from imfvla.types import Observation
 
 FEWEST_CALLS = 50  # of a sampler with many evaluations
@@ -20,6 +21,8 @@ def measure_latency(
     env: Any, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
 ) -> dict[str, dict[str, float]]:
     """Times [ms] by "infer1", ...: median and p95 of a chunk, and the medians of its parts.
+
+    `log_error` is the bootstrapped standard error of the median's logarithm, over calls as if they were independent.
 
     The parts are the encoder with its conditioning, one evaluation of the core, and the overhead: what a chunk takes
     beyond the encoder and n evaluations; `of_parts` is the chunk over that sum. They are timed in turn with the chunk,
@@ -53,9 +56,14 @@ def measure_latency(
             measured[f"infer{number}"] = {
                 "median_ms": float(np.median(chunk)),
                 "p95_ms": float(np.percentile(chunk, 95)),
+                "log_error": bootstrap(_log_median, chunk).error or 0.0,
                 "encoder_ms": float(np.median(encoder)),
                 "core_evaluation_ms": float(np.median(core)),
                 "overhead_ms": float(np.median(chunk - parts)),
                 "of_parts": float(np.median(chunk / parts)),
             }
     return measured
+
+
+def _log_median(times: np.ndarray, axis: int) -> np.ndarray:
+    return np.log(np.median(times, axis=axis))

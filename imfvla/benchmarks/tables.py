@@ -1,5 +1,6 @@
 """What `imfvla.bench` has measured, as tables for people."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ from imfvla.reporting.table import Table, number
 
 PARTS_OF_A_STEP = ("data", "encoder", "core", "jvp", "backward", "optimiser")
 MOST_OF_PARTS = 1.15  # a chunk may cost this share of its encoder and evaluations of the core
+NORMAL_95 = 1.96  # standard errors on each side
 SPEEDS = ("inference_ms_mean", "inference_fps")  # comparisons of Table 3 that follow from times of a chunk
 
 
@@ -86,7 +88,7 @@ def latency_table(experiment: str, figures: Mapping[str, Mapping[str, float]]) -
 def speed_ratios(
     comparisons: Sequence[Comparison], latencies: Mapping[str, Mapping[str, Mapping[str, float]]]
 ) -> dict[str, dict[str, float | str]]:
-    """By printed comparison of Table 3: median times of both chunks [ms], their ratio, the paper's.
+    """By printed comparison of Table 3: median times of both chunks [ms], their ratio with interval, the paper's.
 
     `latencies` are those of experiments as they stand in conf/exp; comparisons of others are left out.
     """
@@ -99,8 +101,11 @@ def speed_ratios(
         ]
         if comparison.of in SPEEDS and len(times) == 2 and all(times):
             slow, fast = (time["median_ms"] for time in times if time)
-            ratio = {"baseline_ms": slow, "ms": fast, "ratio": slow / fast}
-            found[comparison.paper.label] = {**ratio, "paper": comparison.paper.result}
+            factor = math.exp(NORMAL_95 * math.hypot(*(time["log_error"] for time in times if time)))
+            found[comparison.paper.label] = {
+                "baseline_ms": slow, "ms": fast, "ratio": slow / fast, "low": slow / fast / factor,
+                "high": slow / fast * factor, "paper": comparison.paper.result,
+            }  # fmt: skip
     return found
 
 
@@ -108,13 +113,13 @@ def speed_table(ratios: Mapping[str, Mapping[str, Any]]) -> Table:
     """The result of `speed_ratios`."""
     return Table(
         "Speed of one chunk beside the paper's Table 3",
-        ("comparison", "baseline [ms]", "ours [ms]", "ratio", "paper"),
+        ("comparison", "baseline [ms]", "ours [ms]", "ratio (95%)", "paper"),
         tuple(
             (
                 label,
                 number(row["baseline_ms"], 2),
                 number(row["ms"], 2),
-                f"{number(row['ratio'], 2)}×",
+                f"{number(row['ratio'], 2)}× ({number(row['low'], 2)}-{number(row['high'], 2)})",
                 row["paper"],
             )
             for label, row in ratios.items()
