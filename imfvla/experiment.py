@@ -114,6 +114,7 @@ def _train(
     optim: OptimOptions,
     processes: Alone,
 ) -> None:
+    processes.check(training)  # before demonstrations are collected
     if processes.is_first:
         run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
         windows = prepare_windows(config, ensure_demonstrations(config))

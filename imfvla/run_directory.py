@@ -35,6 +35,7 @@ EXECUTION_KEYS = (
     "demos.directory",
     "training.threads",
     "training.compile",
+    "training.sharding",
     "training.on_non_finite",
     "training.prefetch",
     "training.log_every",

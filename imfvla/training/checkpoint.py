@@ -23,6 +23,7 @@ from imfvla.errors import UserError
 from imfvla.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.policy import Policy, build_policy
 from imfvla.run_directory import RunDirectory
+from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"
 WEIGHTS_FORMAT = "imfvla-policy-1"
@@ -46,15 +47,20 @@ class TrainState:
     optimiser: Optimizer  # AdamW
 
 
-def save_state(path: Path, state: TrainState, details: Mapping[str, Any]) -> None:
-    """Writes one file atomically: tensors, and JSON-able `details` (step, logger sums, ...) in its header."""
+def save_state(path: Path, state: TrainState, details: Mapping[str, Any], *, writes: bool = True) -> None:
+    """Writes one file atomically: tensors, and JSON-able `details` (step, logger sums, ...) in its header.
+
+    Where the state is in parts all processes call this, and one of them `writes`.
+    """
     tensors = {f"policy/{name}": tensor for name, tensor in state.policy.state_dict().items()}
     tensors |= {f"averaged/{name}": tensor for name, tensor in state.averaged.state_dict().items()}
     for name, parameter in state.policy.named_parameters():
         kept = state.optimiser.state.get(parameter, {})
         tensors |= {f"adamw/{moment}/{name}": kept[moment] for moment in MOMENTS if moment in kept}
-    header = {"format": STATE_FORMAT, "details": json.dumps(details)}
-    write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
+    tensors = gathered(tensors, keep=writes)
+    if writes:
+        header = {"format": STATE_FORMAT, "details": json.dumps(details)}
+        write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
 
 def load_state(path: Path, state: TrainState) -> dict[str, Any]:
@@ -76,28 +82,36 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
     _refuse_misfits(path, wanted | moments, tensors)
     with torch.no_grad():
         for name, tensor in wanted.items():
-            tensor.copy_(tensors[name])
+            fill(tensor, tensors[name])
         for name, parameter in state.policy.named_parameters():
             names = {moment: f"adamw/{moment}/{name}" for moment in MOMENTS}
             if names["step"] in tensors:
                 state.optimiser.state[parameter] = {
                     "step": tensors[names["step"]].to(parameter.device),
                     **{
-                        moment: torch.empty_like(parameter).copy_(tensors[names[moment]])
+                        moment: fill(torch.empty_like(parameter), tensors[names[moment]])
                         for moment in MOMENTS[1:]
                     },
                 }
     return details
 
 
-def save_weights(directory: Path, policy: nn.Module, description: Mapping[str, Any]) -> None:
-    """Writes `policy.safetensors` and `policy.json` into `directory`, which appears whole or not at all."""
+def save_weights(
+    directory: Path, policy: nn.Module, description: Mapping[str, Any], *, writes: bool = True
+) -> None:
+    """Writes `policy.safetensors` and `policy.json` into `directory`, which appears whole or not at all.
+
+    Where the policy is in parts all processes call this, and one of them `writes`.
+    """
+    tensors = gathered(policy.state_dict(), keep=writes)
+    if not writes:
+        return
     temporary = directory.with_name(directory.name + PARTIAL)
     with clear_write_errors(directory):
         try:
             shutil.rmtree(temporary, ignore_errors=True)
             temporary.mkdir(parents=True)
-            write_tensors(temporary / "policy.safetensors", policy.state_dict(), {"format": WEIGHTS_FORMAT})
+            write_tensors(temporary / "policy.safetensors", tensors, {"format": WEIGHTS_FORMAT})
             sync(temporary / "policy.safetensors")
             write_json(temporary / "policy.json", {"format": WEIGHTS_FORMAT, **description})
             shutil.rmtree(directory, ignore_errors=True)

@@ -17,13 +17,12 @@ class Ema:
     def __init__(self, source: nn.Module, limit: float) -> None:
         self.limit = limit
         self.policy = copy.deepcopy(source).requires_grad_(False).eval()
-        self._averaged = list(self.policy.parameters())
-        self._source = list(source.parameters())
-        self._buffers = list(zip(self.policy.buffers(), source.buffers(), strict=True))
+        self._source = source
 
     @torch.no_grad()
     def update(self, step: int) -> None:
         """Takes the weights after update `step` (0-based) in."""
-        torch._foreach_lerp_(self._averaged, self._source, 1 - decay_at(step, self.limit))
-        for averaged, current in self._buffers:
+        averages, currents = list(self.policy.parameters()), list(self._source.parameters())
+        torch._foreach_lerp_(averages, currents, 1 - decay_at(step, self.limit))
+        for averaged, current in zip(self.policy.buffers(), self._source.buffers(), strict=True):
             averaged.copy_(current)

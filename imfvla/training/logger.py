@@ -78,6 +78,9 @@ class SilentLogger(MetricsLogger):
     def write(self, step: int, **extra: float) -> None:
         pass
 
+    def state(self) -> dict[str, Any]:
+        return {}
+
     def close(self) -> None:
         pass
 

@@ -31,6 +31,7 @@ from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import Alone
 from imfvla.training.precision import autocast, choose_precision
 from imfvla.training.schedule import learning_rate
+from imfvla.training.sharding import FULL, release, shard, whole
 from imfvla.types import Batch
 
 PRECISIONS = ("fp32", "bf16")
@@ -73,7 +74,7 @@ class Trainer:
         processes: Alone | None = None,  # those that share every batch; None for this one alone
     ) -> None:
         self.processes = processes or Alone()
-        self.processes.check(options.batch_size, options.compile)
+        self.processes.check(options)
         torch.set_num_threads(options.threads or max(1, physical_cores() // self.processes.local_size))
         self.device = choose_device(options.device)
         self.policy = policy.to(self.device)
@@ -81,6 +82,9 @@ class Trainer:
         self.seed, self.description = seed, dict(description)
         self.processes.begin_alike(self.policy)
         self.ema = Ema(self.policy, optim.ema_decay)
+        if options.sharding == FULL:
+            shard(self.policy, self.device, loss="loss")
+            shard(self.ema.policy, self.device)
         self.optimiser = make_optimiser(self.policy, optim)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
         self.step = self.saved_step = 0
@@ -109,7 +113,8 @@ class Trainer:
 
         Raises UserError on a non-finite loss or gradient, and on a full disk.
         """
-        if self.step in self.options.checkpoint_steps() and self.step not in self.run.weight_steps():
+        lacking = self.step in self.options.checkpoint_steps() and self.step not in self.run.weight_steps()
+        if any(self.processes.highest([lacking])):
             self._save_weights()  # which a kill has prevented after the state was saved
         if self.is_finished:
             return
@@ -151,8 +156,9 @@ class Trainer:
                     self.step, steps_per_s=rate, data_wait_fraction=waited / seconds, train_s=self.train_s
                 )
                 interval_start, interval_step, waited = now, self.step, 0.0
-            stop = self.processes.highest(self._stop.number or 0)
-            if self.step in keep_weights or stop or now - last_save >= self.options.save_every_s:
+            due = self.step in keep_weights or now - last_save >= self.options.save_every_s
+            stop, due = self.processes.highest([self._stop.number or 0, due])  # clocks differ
+            if stop or due:
                 self._save_state(logger)
                 last_save = time.perf_counter()
             if self.step in keep_weights:  # after the state: the last weights say that all is saved
@@ -183,7 +189,7 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.processes.average_gradients(self.policy.parameters())
-        norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm).item()
+        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm)).item()
         if not math.isfinite(norm):
             return self._skip("norm of the gradient", norm, batch)
         self.optimiser.step()
@@ -194,6 +200,7 @@ class Trainer:
 
     def _skip(self, what: str, value: float, batch: Batch) -> None:
         """Leaves the weights as they are. Raises UserError where training is to stop."""
+        release(self.policy)
         cause = name_cause(
             self.policy,
             batch.to(self.device),
@@ -208,8 +215,6 @@ class Trainer:
         self.step += 1
 
     def _save_weights(self) -> None:
-        if not self.processes.is_first:
-            return
         description = {
             "step": self.step,
             "train_s": round(self.train_s, 1),
@@ -217,12 +222,11 @@ class Trainer:
             "fingerprint": fingerprint(device=str(self.device), threads=torch.get_num_threads()),
             **self.description,
         }
-        save_weights(self.run.weights_directory(self.step), self.ema.policy, description)
+        directory = self.run.weights_directory(self.step)
+        save_weights(directory, self.ema.policy, description, writes=self.processes.is_first)
 
     def _save_state(self, logger: MetricsLogger) -> None:
         self.saved_step = self.step
-        if not self.processes.is_first:
-            return
         details = {
             "step": self.step,
             "train_s": self.train_s,
@@ -231,7 +235,7 @@ class Trainer:
             "logger": logger.state(),
             "code": code_version(),
         }
-        save_state(self.run.last_state, self.state, details)
+        save_state(self.run.last_state, self.state, details, writes=self.processes.is_first)
 
 
 def step_seed(seed: int, step: int) -> int:

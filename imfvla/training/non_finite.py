@@ -10,6 +10,7 @@ from torch import nn
 
 from imfvla.errors import UserError
 from imfvla.training.parallel import WholeBatchDraws, rows
+from imfvla.training.sharding import release, whole
 from imfvla.types import Batch
 
 STOP, SKIP = "stop", "skip"
@@ -60,9 +61,10 @@ def _is_finite(policy: nn.Module, batch: Batch, seed: int, row: int, size: int) 
     with WholeBatchDraws(rng, 1, row, size):
         loss, _ = policy.loss(rows(batch, slice(row, row + 1)), rng)
     if not math.isfinite(loss.item()):
+        release(policy)
         return False
     loss.backward()
-    return all(p.grad.isfinite().all() for p in policy.parameters() if p.grad is not None)
+    return all(whole(p.grad).isfinite().all() for p in policy.parameters() if p.grad is not None)
 
 
 def _listed(items: Sequence[str]) -> str:

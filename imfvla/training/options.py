@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from imfvla.options import require
+from imfvla.training.sharding import SHARDINGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +20,7 @@ class TrainingOptions:
     compile: bool
     device: str  # cpu | cuda | auto
     threads: int | None  # OpenMP threads of a process, None for its share of the physical cores
+    sharding: str  # none | full: whether each of several processes holds all of the policy or its part
     on_non_finite: str  # stop | skip: at a batch whose loss or gradient is not finite
 
     def __post_init__(self) -> None:
@@ -37,6 +39,12 @@ class TrainingOptions:
         )
         devices = ("cpu", "cuda", "auto")
         require(self.device in devices, "training.device", "one of " + ", ".join(devices), self.device)
+        require(
+            self.sharding in SHARDINGS,
+            "training.sharding",
+            "one of " + ", ".join(SHARDINGS),
+            self.sharding,
+        )
         require(
             self.on_non_finite in ("stop", "skip"),
             "training.on_non_finite",

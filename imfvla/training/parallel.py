@@ -25,6 +25,8 @@ from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
 from imfvla.errors import UserError
+from imfvla.training.options import TrainingOptions
+from imfvla.training.sharding import NONE, is_part
 from imfvla.types import Batch, Observation
 
 TIMEOUT = timedelta(days=1)  # others wait while process 0 collects demonstrations
@@ -54,19 +56,24 @@ class Alone:
         """Where the loss of `count` rows is computed, as those rows of the whole batch's."""
         return nullcontext() if self.size == 1 else WholeBatchDraws(rng, count, self.rank, self.size)
 
-    def check(self, batch_size: int, compile_loss: bool) -> None:
-        """Raises UserError where a batch cannot be shared out."""
+    def check(self, options: TrainingOptions) -> None:
+        """Raises UserError where a batch, or with `sharding` a policy, cannot be shared out."""
+        if options.sharding != NONE:
+            raise UserError(
+                f"training.sharding={options.sharding} needs several processes, found one: start them with "
+                "torchrun --nproc-per-node=2 -m imfvla.train ..., or set training.sharding=none."
+            )
 
     def mean(self, values: Sequence[float]) -> list[float]:
         """Of each value over the processes."""
         return list(values)
 
-    def highest(self, value: int) -> int:
-        """Of the values of all processes."""
-        return value
+    def highest(self, values: Sequence[int]) -> list[int]:
+        """Of each value over the processes."""
+        return list(values)
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Gradients become their mean over the processes."""
+        """Gradients become their mean over the processes, as those in parts already are."""
 
     def begin_alike(self, policy: nn.Module) -> None:
         """The weights become those of process 0."""
@@ -83,12 +90,12 @@ class Alone:
 class Shared(Alone):
     """One of the processes that torchrun has started."""
 
-    def check(self, batch_size: int, compile_loss: bool) -> None:
-        if batch_size % self.size:
+    def check(self, options: TrainingOptions) -> None:
+        if options.batch_size % self.size:
             raise UserError(
-                f"training.batch_size must be a multiple of the {self.size} processes, found {batch_size}."
+                f"training.batch_size must be a multiple of the {self.size} processes, found {options.batch_size}."
             )
-        if compile_loss:
+        if options.compile:
             raise UserError(f"training.compile must be false with several processes, found {self.size}.")
 
     def mean(self, values: Sequence[float]) -> list[float]:
@@ -96,13 +103,14 @@ class Shared(Alone):
         dist.all_reduce(total)
         return (total / self.size).tolist()
 
-    def highest(self, value: int) -> int:
-        found = torch.tensor([value], device=_device())
+    def highest(self, values: Sequence[int]) -> list[int]:
+        found = torch.tensor(values, dtype=torch.int64, device=_device())
         dist.all_reduce(found, dist.ReduceOp.MAX)
-        return int(found)
+        return found.tolist()
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        for gradients in _buckets([p.grad for p in parameters if p.grad is not None]):
+        own = [p.grad for p in parameters if p.grad is not None and not is_part(p.grad)]
+        for gradients in _buckets(own):
             flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
             dist.all_reduce(flat)
             flat /= self.size
@@ -121,7 +129,7 @@ class Shared(Alone):
         return values[int(chosen)]
 
     def wait(self) -> None:
-        self.highest(0)
+        self.highest([0])
 
 
 @contextmanager

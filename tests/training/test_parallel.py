@@ -1,95 +1,26 @@
 """Several processes compute what one computes: each takes its rows and their random numbers."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load_file
-from tiny_policy import CountedBatches
+from processes import Job, assert_close, launch, train
+from tiny_policy import OPTIONS, CountedBatches
 from torch.nn import functional as F
 
 from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.policy import build_policy
-from imfvla.training.logger import read_metrics
 from imfvla.training.parallel import Alone, Shared, WholeBatchDraws, rows
 from imfvla.types import Batch, Observation
 
-HERE = Path(__file__).parent
-# A process of torchrun's: trains to sys.argv[2] steps and may die at a step, the first time it gets there.
-SCRIPT = """
-import os, signal, sys
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
-sys.path.insert(0, sys.argv[3])
-from tiny_policy import CountedBatches, OPTIM, OPTIONS, TinyPolicy
-from imfvla.run_directory import RunDirectory
-from imfvla.signals import Stopped
-from imfvla.training.loop import Trainer
-from imfvla.training.parallel import joined_processes
 
-class Dies(TinyPolicy):
-    def loss(self, batch, rng):
-        assert len(batch.actions) == 8 // int(os.environ.get("WORLD_SIZE", 1))
-        marker = Path(sys.argv[1] + "-died")
-        if trainer.step == int(sys.argv[4]) and trainer.processes.rank == 1 and not marker.exists():
-            marker.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        if trainer.step == int(sys.argv[2]) - 1 < 5 and trainer.processes.rank == 1:
-            os.kill(os.getpid(), signal.SIGTERM)  # one is asked, all stop after the same step
-        return super().loss(batch, rng)
-
-with joined_processes("cpu") as processes:
-    options = replace(OPTIONS, steps=6, log_every=1)
-    trainer = Trainer(Dies(), CountedBatches(), RunDirectory(sys.argv[1]), options, OPTIM, seed=7, description={},
-                      processes=processes)
-    with suppress(Stopped):
-        trainer.train()
-"""
-
-
-def torchrun(
-    tmp_path: Path, run: Path, size: int, until: int = 6, dies_at: int = -1, restarts: int = 0
-) -> None:
-    (tmp_path / "train.py").write_text(SCRIPT)
-    command = [
-        sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={size}",
-        f"--max-restarts={restarts}", "--monitor-interval=0.1", str(tmp_path / "train.py"), str(run), str(until),
-        str(HERE), str(dies_at),
-    ]  # fmt: skip
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
-    assert done.returncode == 0, done.stderr[-3000:]
-
-
-def assert_close(one: Path, other: Path) -> None:
-    tensors, expected = (load_file(run / "checkpoints/last/state.safetensors") for run in (one, other))
-    assert tensors.keys() == expected.keys()
-    for name, tensor in tensors.items():
-        torch.testing.assert_close(tensor, expected[name], rtol=1e-4, atol=1e-6)
-    curves = [[row["loss"] for row in read_metrics(run / "metrics.jsonl")] for run in (one, other)]
-    assert curves[0] == pytest.approx(curves[1], rel=1e-5)
-    assert len(curves[0]) == 6
-
-
-def test_two_processes_equal_one_go_on_as_one_and_survive_a_death(tmp_path, make_trainer):
-    """The process that dies at step 5 makes torchrun start both again; they go on from the last state."""
+def test_two_processes_equal_one_and_one_goes_on_from_what_they_began(tmp_path, make_trainer):
     make_trainer(tmp_path / "one", steps=6, log_every=1).train()
-    torchrun(tmp_path, tmp_path / "two", size=2, dies_at=4, restarts=1)
-    assert (tmp_path / "two-died").exists()
+    jobs = [Job(str(tmp_path / "two")), Job(str(tmp_path / "mixed"), stops_before=2)]
+    launch(jobs, tmp_path / "jobs.json")
     assert_close(tmp_path / "two", tmp_path / "one")
-
-
-def test_what_two_processes_began_one_process_finishes(tmp_path, make_trainer):
-    make_trainer(tmp_path / "one", steps=6, log_every=1).train()
-    torchrun(tmp_path, tmp_path / "mixed", size=2, until=3)
-    resumed = make_trainer(tmp_path / "mixed", steps=6, log_every=1)
-    assert resumed.step == 3
-    resumed.train()
+    assert train(Job(str(tmp_path / "mixed")), Alone()) == 3
     assert_close(tmp_path / "mixed", tmp_path / "one")
 
 
@@ -168,8 +99,10 @@ def test_gradients_of_shares_average_to_those_of_the_batch(generator):
 
 def test_a_batch_that_cannot_be_shared_out_is_refused():
     with pytest.raises(UserError, match=r"batch_size must be a multiple of the 3 processes, found 8"):
-        Shared(0, 3, 3).check(8, compile_loss=False)
+        Shared(0, 3, 3).check(OPTIONS)
     with pytest.raises(UserError, match=r"training\.compile must be false with several processes"):
-        Shared(0, 2, 2).check(8, compile_loss=True)
-    Alone().check(7, compile_loss=True)
+        Shared(0, 2, 2).check(replace(OPTIONS, compile=True))
+    with pytest.raises(UserError, match=r"training\.sharding=full needs several processes, found one"):
+        Alone().check(replace(OPTIONS, sharding="full"))
+    Alone().check(replace(OPTIONS, batch_size=7, compile=True))
     assert len(Shared(1, 2, 2).share(next(CountedBatches())).actions) == 4

@@ -22,6 +22,7 @@ OPTIONS = TrainingOptions(
     compile=False,
     device="cpu",
     threads=1,
+    sharding="none",
     on_non_finite="stop",
 )
 OPTIM = OptimOptions(

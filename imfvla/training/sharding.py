@@ -1,0 +1,79 @@
+"""Training of which every process holds a part: `training.sharding=full`, by FSDP2 of PyTorch (arXiv 2304.11277).
+
+- In parts at all times: parameters, gradients of the step, AdamW's moments, the average of the weights.
+- Whole in every process: buffers and activations; the weights from the beginning of a loss to the end of its backward
+  pass, and with them the gradients until they are scattered; the state while it is read or gathered to be written.
+- The policy is one unit. FSDP acts where a unit's forward method is called, and a loss reaches past those of the
+  policy's parts (keys and values of a block, a Jacobian-vector product), so smaller units would stay in parts.
+  The loss itself is therefore what FSDP is told to take for the forward method.
+- Files hold whole tensors under their usual names: whoever reads them need not know how they were trained.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+NONE, FULL = "none", "full"
+SHARDINGS = (NONE, FULL)
+
+
+def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -> None:
+    """Leaves every process its part of the parameters of `module`, which are alike in all of them.
+
+    `loss` names the method before which they are gathered; after its backward pass every process has its part of the
+    gradients' mean over the processes.
+    """
+    from torch.distributed import (
+        get_world_size,
+        init_device_mesh,
+    )  # here: a second that nobody else need wait
+    from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
+
+    for parameter in module.parameters():
+        parameter.data = parameter.data.contiguous()  # FSDP takes no channels-last kernels
+    fully_shard(module, mesh=init_device_mesh(device.type, (get_world_size(),)))
+    if loss is not None:
+        register_fsdp_forward_method(module, loss)
+
+
+def is_part(tensor: Tensor) -> bool:
+    """Whether it is in parts, a DTensor; that class comes with an import of a second."""
+    return hasattr(tensor, "full_tensor")
+
+
+def whole(tensor: Tensor) -> Tensor:
+    """All of a tensor. Where it is in parts, all processes must ask for it."""
+    return tensor.full_tensor() if is_part(tensor) else tensor
+
+
+def gathered(tensors: Mapping[str, Tensor], *, keep: bool) -> dict[str, Tensor]:
+    """Whole tensors on the CPU, one after the other; none where a process only lends its parts."""
+    found = {}
+    for name, tensor in tensors.items():
+        all_of_it = whole(tensor.detach())
+        if keep:
+            found[name] = all_of_it.cpu()
+    return found
+
+
+def fill(tensor: Tensor, content: Tensor) -> Tensor:
+    """Copies whole `content` into a tensor, or this process's part of it into one in parts; returns `tensor`."""
+    if is_part(tensor):
+        from torch.distributed.tensor import distribute_tensor
+
+        layout: Any = tensor
+        content = distribute_tensor(
+            content.to(layout.device_mesh.device_type),
+            layout.device_mesh,
+            layout.placements,
+            src_data_rank=None,  # each process has read all of it
+        )
+    return tensor.copy_(content)
+
+
+def release(policy: nn.Module) -> None:
+    """After a loss without a backward pass: the weights are in parts again. Of a whole policy nothing changes."""
+    if reset := getattr(policy, "reset_iter_state", None):
+        reset()
