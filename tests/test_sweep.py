@@ -10,18 +10,14 @@ import tiny_sweep
 
 from imfvla.completion import is_complete
 from imfvla.composition import CONFIG_DIRECTORY, run_name
-from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import untimed
-from imfvla.reporting.results import Result
-from imfvla.reporting.tables import other_table
 from imfvla.run_directory import DONE, LAST, RunDirectory
 from imfvla.sweep import Planned, _Sweep, jobs_of_rows, waves
 
 MAPPING = read_mapping()
 FILES = sorted(path.stem for path in (CONFIG_DIRECTORY / "sweep").glob("*.yaml"))
 JOBS = ["-m", "seed=0,1", "core=attnres,standard", *tiny_sweep.OVERRIDES]
-TIMES = ("latency", "fps")
 
 
 @cache
@@ -122,17 +118,8 @@ def test_a_sweep_killed_in_the_middle_goes_on_and_ends_as_an_undisturbed_one(job
         assert rows == twins
         protocols = [json.loads((p.parent / "summary.json").read_text())["protocol"] for p in (path, twin)]
         assert protocols[0] == protocols[1]  # with the digest of the weights
-    assert untimed_table(undisturbed) == untimed_table(killed)
-    assert len(untimed_table(killed)) == 4
-
-
-def untimed_table(directory: Path) -> list[dict[str, str]]:
-    """Our rows, which stand in none of the paper's, without what was timed."""
-    table = other_table([Result([found]) for found in Sources([directory / "runs"]).others([])]).data
-    named = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    return [
-        {key: value for key, value in row.items() if not any(name in key for name in TIMES)} for row in named
-    ]
+    assert tiny_sweep.untimed_table(undisturbed) == tiny_sweep.untimed_table(killed)
+    assert len(tiny_sweep.untimed_table(killed)) == 4
 
 
 def test_one_failure_ends_no_other_job_and_finished_ones_are_skipped(jobs, tmp_path, monkeypatch, capfd):

@@ -29,11 +29,13 @@ OVERRIDES = [
     "training.log_every=1",
     "training.save_every_s=0",
     "training.threads=1",
+    "training.precision=fp32",
     "evaluation.nfe=[1]",
     "evaluation.episodes=2",
     "evaluation.workers=0",
 ]
 UPDATES = Path("updates.log")
+TIMES = ("latency", "fps")
 
 
 def launch(arguments: list[str], directory: Path, **environment: str) -> subprocess.CompletedProcess:
@@ -84,6 +86,19 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
     env = FakeEnvironment()
     env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
     return env, load_policy(RunDirectory(run), step)
+
+
+def untimed_table(directory: Path) -> list[dict[str, str]]:
+    """Our rows, which stand in none of the paper's, without what was timed."""
+    from imfvla.reporting.answers import Sources
+    from imfvla.reporting.results import Result
+    from imfvla.reporting.tables import other_table
+
+    table = other_table([Result([found]) for found in Sources([directory / "runs"]).others([])]).data
+    named = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    return [
+        {key: value for key, value in row.items() if not any(name in key for name in TIMES)} for row in named
+    ]
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
 - In parts at all times: parameters, gradients of the step, AdamW's moments, the average of the weights.
 - Whole in every process: buffers and activations; the weights from the beginning of a loss to the end of its backward
-  pass, and with them the gradients until they are scattered; the state while it is read or gathered to be written.
-- The policy is one unit. FSDP acts where a unit's forward method is called, and a loss reaches past those of the
-  policy's parts (keys and values of a block, a Jacobian-vector product), so smaller units would stay in parts.
-  The loss itself is therefore what FSDP is told to take for the forward method.
+  pass (those of the encoder not between its passes), and with them the gradients until they are scattered; the state
+  while it is read. Process 0 gathers the state to write it.
+- FSDP acts where the forward method of a unit is called. A loss calls that of the encoder, but reaches past those of
+  the core and its blocks (keys and values of a context, a Jacobian-vector product), so that these would stay in parts.
+  The units are therefore the encoder and all else, and the loss itself is what FSDP is told to take for the latter's
+  forward method.
 - Files hold whole tensors under their usual names: whoever reads them need not know how they were trained.
 """
 
@@ -20,7 +22,7 @@ SHARDINGS = (NONE, FULL)
 
 
 def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -> None:
-    """Leaves every process its part of the parameters of `module`, which are alike in all of them.
+    """Leaves every process its part of the parameters of `module`, a policy, which are alike in all of them.
 
     `loss` names the method before which they are gathered; after its backward pass every process has its part of the
     gradients' mean over the processes.
@@ -33,7 +35,10 @@ def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -
 
     for parameter in module.parameters():
         parameter.data = parameter.data.contiguous()  # FSDP takes no channels-last kernels
-    fully_shard(module, mesh=init_device_mesh(device.type, (get_world_size(),)))
+    mesh = init_device_mesh(device.type, (get_world_size(),))
+    for unit in (getattr(module, "encoder", None), module):
+        if unit is not None:
+            fully_shard(unit, mesh=mesh)
     if loss is not None:
         register_fsdp_forward_method(module, loss)
 

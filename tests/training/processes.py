@@ -16,16 +16,10 @@ import torch
 from safetensors.torch import load_file
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
-from imfvla.composition import compose
-from imfvla.options import build
-from imfvla.policy import build_policy
 from imfvla.run_directory import RunDirectory
 from imfvla.signals import Stopped
-from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
-from imfvla.training.optimiser import OptimOptions
-from imfvla.training.options import TrainingOptions
 from imfvla.training.parallel import Alone, joined_processes
 
 
@@ -68,19 +62,33 @@ class SharingPolicy(TinyPolicy):
 
 def make_trainer(job: Job, processes: Alone) -> Trainer:
     """As the job says; in a test, with `Alone()`, what several processes are compared with."""
-    run = RunDirectory(job.run)
     if job.overrides is None:
+        is_last = processes.rank == processes.size - 1
         options = replace(OPTIONS, **{"steps": 6, "log_every": 1} | job.options)
-        batches = FaultyBatches(job, processes.rank == processes.size - 1)
-        policy, optim = SharingPolicy(), OPTIM
+        parts = SharingPolicy(), FaultyBatches(job, is_last), RunDirectory(job.run), options, OPTIM
     else:
-        config = compose("train", job.overrides)
-        windows = prepare_windows(config, Path(job.demos))
-        torch.manual_seed(0)
-        policy, batches = build_policy(config, windows.statistics()), make_loader(config, windows)
-        options = build(TrainingOptions, config["training"], "training")
-        optim = build(OptimOptions, config["optim"], "optim")
-    return Trainer(policy, batches, run, options, optim, seed=7, description={}, processes=processes)
+        parts = composed_parts(job)
+    return Trainer(*parts, seed=7, description={}, processes=processes)
+
+
+def composed_parts(job: Job) -> tuple[Any, ...]:
+    """The first arguments of a trainer, as the overrides of a job say."""
+    from imfvla.composition import compose  # here: the tiny policy starts sooner without
+    from imfvla.options import build
+    from imfvla.policy import build_policy
+    from imfvla.training.data import make_loader, prepare_windows
+    from imfvla.training.options import OptimOptions, TrainingOptions
+
+    config = compose("train", job.overrides)
+    windows = prepare_windows(config, Path(job.demos))
+    torch.manual_seed(0)
+    return (
+        build_policy(config, windows.statistics()),
+        make_loader(config, windows),
+        RunDirectory(job.run),
+        build(TrainingOptions, config["training"], "training"),
+        build(OptimOptions, config["optim"], "optim"),
+    )
 
 
 def train(job: Job, processes: Alone) -> int:
@@ -121,11 +129,12 @@ def assert_close(one: Path, other: Path, steps: int = 6) -> None:
     assert len(curves[0]) == steps
 
 
-def main() -> None:
+def train_all(jobs: list[Job]) -> None:
+    """One after the other, by the processes that this one is of."""
     with joined_processes("cpu") as processes:
-        for job in json.loads(Path(sys.argv[1]).read_text()):
-            train(Job(**job), processes)
+        for job in jobs:
+            train(job, processes)
 
 
 if __name__ == "__main__":
-    main()
+    train_all([Job(**job) for job in json.loads(Path(sys.argv[1]).read_text())])

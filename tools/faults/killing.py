@@ -1,0 +1,144 @@
+"""SIGKILL at random moments over one piece of work, every second one while a file is being written."""
+
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from faults.outcome import Differs, compare
+from imfvla.errors import UserError
+from imfvla.jobs import told
+from imfvla.signals import Stopped, stoppable
+
+POLL_S = 0.001
+Work = Callable[[Path], None]
+
+
+def start(work: Work, folder: Path) -> int:
+    """The process that does `work`; what it says goes to `folder`.log."""
+    sys.stdout.flush()
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        output = os.open(f"{folder}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        with stoppable():
+            work(folder)
+        code = 0
+    except Stopped as stop:
+        code = stop.exit_code
+    except Exception as error:  # as the entry points tell it
+        found = told(error)
+        is_users = isinstance(found, UserError)
+        print(found if is_users else repr(found), file=sys.stderr, flush=True)
+        code = 2 if is_users else 1
+    finally:
+        os._exit(code)
+
+
+def ended(child: int) -> int | None:
+    """Its exit code, negative for a signal; None while it runs."""
+    pid, status = os.waitpid(child, os.WNOHANG)
+    return os.waitstatus_to_exitcode(status) if pid else None
+
+
+def half_written(folder: Path) -> list[str]:
+    """Files that are being written, or that a killed process was writing."""
+    names = []
+    for path in files_of(folder):
+        is_cut = path.suffix == ".jsonl" and not content(path).endswith(b"\n") and content(path)
+        if is_cut or {".tmp", ".part", ".trial"} & {path.suffix, path.parent.suffix}:
+            names.append(path.name)
+    return names
+
+
+def progress_of(folder: Path) -> int:
+    """Rows and recordings so far."""
+    total = len(list(folder.glob("*/*.mcap")))
+    for path in files_of(folder):
+        if path.name == "metrics.jsonl" or (path.suffix == ".jsonl" and path.parents[1].name == "rollouts"):
+            total += content(path).count(b"\n")
+    return total
+
+
+def files_of(folder: Path) -> Iterator[Path]:
+    """All files in a folder, from which some vanish meanwhile."""
+    return (Path(place, name) for place, _, names in os.walk(folder) for name in names)
+
+
+def content(path: Path) -> bytes:
+    """Of a file; nothing where it has vanished."""
+    with suppress(FileNotFoundError):
+        return path.read_bytes()
+    return b""
+
+
+def kill_over(
+    work: Work, folder: Path, kills: int, amount: int, rng: random.Random, *, spread_s: float = 0.02
+) -> tuple[int, int]:
+    """Starts `work` until it ends by itself, killing it up to `kills` times, `amount` units of progress over all.
+
+    A kill that waits for no write comes up to `spread_s` seconds after some progress. Returns the kills, and how many
+    of them fell into a write: a half-written file was there afterwards.
+    """
+    done = during_write = 0
+    while True:
+        child, began_at = start(work, folder), progress_of(folder)
+        left = int(0.9 * amount) - began_at  # so that the last kill does not come after the end
+        goal = began_at + rng.randint(0, max(0, 2 * left // max(1, kills - done) - 1))
+        while (code := ended(child)) is None:
+            if done < kills and progress_of(folder) >= goal:
+                deadline = time.monotonic() + 2.0
+                if done % 2:  # while a file is being written
+                    while not half_written(folder) and ended_or_late(child, deadline):
+                        pass
+                else:
+                    time.sleep(rng.random() * spread_s)
+                with suppress(ProcessLookupError):
+                    os.kill(child, signal.SIGKILL)
+                _, status = os.waitpid(child, 0)
+                code = os.waitstatus_to_exitcode(status)
+                break
+            time.sleep(POLL_S)
+        if code == -signal.SIGKILL:
+            done += 1
+            during_write += bool(half_written(folder))
+        elif code == 0:
+            return done, during_write
+        else:
+            raise Differs(f"exit code {code}: {Path(f'{folder}.log').read_text()[-500:]}")
+
+
+def ended_or_late(child: int, deadline: float) -> bool:
+    """Whether to go on waiting: the child runs and there is time."""
+    info = os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    return info is None and time.monotonic() < deadline
+
+
+def undisturbed(work: Work, folder: Path) -> None:
+    """Does it once, in a process like those that are killed."""
+    _, status = os.waitpid(start(work, folder), 0)
+    if code := os.waitstatus_to_exitcode(status):
+        raise Differs(f"the undisturbed run ended with {code}: {Path(f'{folder}.log').read_text()[-500:]}")
+
+
+def kills_of(work: Work, leaves: Callable[[Path], dict[str, Any]], amount: int) -> Callable[..., str]:
+    """A fault: SIGKILL over one piece of work."""
+
+    def inject(folder: Path, kills: int, rng: random.Random) -> str:
+        undisturbed(work, folder / "whole")
+        done, during_write = kill_over(work, folder / "killed", kills, amount, rng)
+        equal = compare(leaves(folder / "killed"), leaves(folder / "whole"))
+        if done < kills:
+            raise Differs(f"ended after {done} of {kills} kills")
+        return f"{done} kills, {during_write} of them into a write; {equal} parts equal bit for bit"
+
+    return inject

@@ -1,0 +1,57 @@
+"""What is disturbed: trainings, collections and evaluations of the tests' tiny policy and stand-in for a simulator."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from fakes import FakeEnvironment, build_fakes, known_actions
+from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
+
+from imfvla import collection, workbench
+from imfvla.episode import Decision
+from imfvla.evaluation import evaluate
+from imfvla.run_directory import RunDirectory
+from imfvla.training.loop import Trainer
+
+
+def train(folder: Path, steps: int, save_every_s: float = 0.0) -> None:
+    """A whole training, by default with a state after every step."""
+    options = replace(OPTIONS, steps=steps, log_every=1, checkpoints=4, save_every_s=save_every_s)
+    Trainer(
+        TinyPolicy(), CountedBatches(), RunDirectory(folder), options, OPTIM, seed=7, description={}
+    ).train()
+
+
+def roll_out(folder: Path, episodes: int) -> None:
+    """An evaluation with its three recordings."""
+    run = RunDirectory(folder)
+    run.weights_directory(1).mkdir(parents=True, exist_ok=True)
+    (run.weights_directory(1) / "policy.safetensors").write_bytes(b"read by nobody")
+    observation = {"views": ["front"], "image_size": [16, 16]}
+    config = {"name": "chaos", "task": {"name": "fake", "variant": "default"}, "observation": observation}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    workbench._bench.cache_clear()
+    evaluate(run, episodes=episodes, first_seed=100_000, nfe=[1], workers=0, build=build_fakes)
+
+
+class Demonstrator:
+    """Does what is known; its environment counts every fourth seed as a success."""
+
+    def reset(self, env: Any, seed: int) -> None:
+        self.actions = known_actions(40)
+
+    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+        return Decision(self.actions[step], self.actions[step])
+
+
+def collect(folder: Path, episodes: int) -> None:
+    """Demonstrations, three of four of which fail."""
+    env = FakeEnvironment()
+    env.model_digest = lambda: "0" * 16
+    env.paraphrases = ()
+    collection._stage_for = lambda settings: (env, Demonstrator())
+    task = {"name": "fake", "variant": "default", "expert": {"modes": 1, "noise": 0.0, "hold": 18}}
+    demos = {"episodes": episodes, "first_seed": 0, "directory": str(folder), "camera_every": 2, "workers": 0}
+    collection.collect(task, {"views": ["front", "top"], "image_size": [16, 16]}, demos)
