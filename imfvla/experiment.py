@@ -69,6 +69,8 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
     run.refuse_links_outside()
     with joined_processes(training.device) as processes:
+        if training.steps not in run.weight_steps():  # else there is nothing to train
+            processes.check(training)
         if processes.is_first:
             _run_stages(config, run, training, optim, evaluation, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
@@ -114,7 +116,6 @@ def _train(
     optim: OptimOptions,
     processes: Alone,
 ) -> None:
-    processes.check(training)  # before demonstrations are collected
     if processes.is_first:
         run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
         windows = prepare_windows(config, ensure_demonstrations(config))

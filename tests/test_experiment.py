@@ -101,6 +101,7 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("horizon.exec=64", r"horizon\.exec must not exceed horizon\.pred"),
         ("training.steps=0", r"training\.steps must be at least 1"),
         ("training.steps=many", r"training\.steps must be a whole number, found 'many'"),
+        ("training.sharding=full", r"training\.sharding=full needs several processes, found one"),
         ("optim.lr=-1", r"optim\.lr must be above 0"),
         ("evaluation.nfe=fast", r"evaluation\.nfe must be a list"),
         ("evaluation.nfe=[]", r"evaluation\.nfe must be one or more numbers of evaluations"),

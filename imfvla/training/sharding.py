@@ -1,9 +1,9 @@
 """Training of which every process holds a part: `training.sharding=full`, by FSDP2 of PyTorch (arXiv 2304.11277).
 
-- In parts at all times: parameters, gradients of the step, AdamW's moments, the average of the weights.
-- Whole in every process: buffers and activations; the weights from the beginning of a loss to the end of its backward
-  pass (those of the encoder not between its passes), and with them the gradients until they are scattered; the state
-  while it is read. Process 0 gathers the state to write it.
+- In parts: parameters, gradients, AdamW's moments, the average of the weights.
+- Whole in every process: buffers and activations; from the beginning of a loss to the end of its backward pass the
+  weights (those of the encoder not between its passes) and the gradients, until they are scattered; the state while it
+  is read. Process 0 gathers the state to write it.
 - FSDP acts where the forward method of a unit is called. A loss calls that of the encoder, but reaches past those of
   the core and its blocks (keys and values of a context, a Jacobian-vector product), so that these would stay in parts.
   The units are therefore the encoder and all else, and the loss itself is what FSDP is told to take for the latter's
@@ -27,10 +27,8 @@ def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -
     `loss` names the method before which they are gathered; after its backward pass every process has its part of the
     gradients' mean over the processes.
     """
-    from torch.distributed import (
-        get_world_size,
-        init_device_mesh,
-    )  # here: a second that nobody else need wait
+    # Here: a second that nobody else need wait.
+    from torch.distributed import get_world_size, init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
     for parameter in module.parameters():

@@ -14,6 +14,7 @@ from imfvla.errors import UserError
         ({"precision": "fp16"}, r"training\.precision must be one of fp32, bf16, auto, found 'fp16'"),
         ({"device": "tpu"}, r"training\.device"),
         ({"threads": 0}, r"training\.threads must be null or at least 1"),
+        ({"sharding": "half"}, r"training\.sharding must be one of none, full, found 'half'"),
         ({"save_every_s": -1.0}, r"training\.save_every_s"),
     ],
 )

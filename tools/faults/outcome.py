@@ -13,6 +13,7 @@ from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
+NOT_OF_WORK = {"train_s", "code"}  # of a state's header: somebody may commit meanwhile
 
 
 class Differs(Exception):
@@ -28,7 +29,7 @@ def state_of(folder: Path) -> dict[str, Any]:
         tensors, header = read_tensors(path)
         found |= {f"{name}: {key}": tensor for key, tensor in tensors.items()}
         details = json.loads(header.get("details", "{}"))
-        found[f"{name}: header"] = {key: value for key, value in details.items() if key != "train_s"}
+        found[f"{name}: header"] = {key: details[key] for key in details.keys() - NOT_OF_WORK}
     rows = read_metrics(run.metrics)
     found["metrics"] = [{key: value for key, value in row.items() if key not in TIMES} for row in rows]
     return found
