@@ -50,14 +50,20 @@ def ended(child: int) -> int | None:
     return os.waitstatus_to_exitcode(status) if pid else None
 
 
-def half_written(folder: Path) -> list[str]:
-    """Files that are being written, or that a killed process was writing."""
-    names = []
+def half_written(folder: Path) -> set[tuple[str, int]]:
+    """Files that are being written, or that a killed process was writing, with the times of their last change."""
+    found = set()
     for path in files_of(folder):
-        is_cut = path.suffix == ".jsonl" and not content(path).endswith(b"\n") and content(path)
-        if is_cut or {".tmp", ".part", ".trial"} & {path.suffix, path.parent.suffix}:
-            names.append(path.name)
-    return names
+        with suppress(FileNotFoundError):
+            if {".tmp", ".part", ".trial"} & {path.suffix, path.parent.suffix} or is_cut(path):
+                found.add((path.name, path.stat().st_mtime_ns))
+    return found
+
+
+def is_cut(path: Path) -> bool:
+    """Whether its last line is not whole."""
+    text = content(path) if path.suffix == ".jsonl" else b""
+    return bool(text) and not text.endswith(b"\n")
 
 
 def progress_of(folder: Path) -> int:
@@ -91,6 +97,7 @@ def kill_over(
     """
     done = during_write = 0
     while True:
+        left_over = half_written(folder)  # by earlier kills
         child, began_at = start(work, folder), progress_of(folder)
         left = int(0.9 * amount) - began_at  # so that the last kill does not come after the end
         goal = began_at + rng.randint(0, max(0, 2 * left // max(1, kills - done) - 1))
@@ -98,7 +105,7 @@ def kill_over(
             if done < kills and progress_of(folder) >= goal:
                 deadline = time.monotonic() + 2.0
                 if done % 2:  # while a file is being written
-                    while not half_written(folder) and ended_or_late(child, deadline):
+                    while half_written(folder) <= left_over and ended_or_late(child, deadline):
                         pass
                 else:
                     time.sleep(rng.random() * spread_s)
@@ -110,7 +117,7 @@ def kill_over(
             time.sleep(POLL_S)
         if code == -signal.SIGKILL:
             done += 1
-            during_write += bool(half_written(folder))
+            during_write += not half_written(folder) <= left_over
         elif code == 0:
             return done, during_write
         else:
