@@ -17,6 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.errors import UserError
+
 NONE, FULL = "none", "full"
 SHARDINGS = (NONE, FULL)
 
@@ -25,8 +27,13 @@ def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -
     """Leaves every process its part of the parameters of `module`, a policy, which are alike in all of them.
 
     `loss` names the method before which they are gathered; after its backward pass every process has its part of the
-    gradients' mean over the processes.
+    gradients' mean over the processes. Raises UserError where a parameter cannot be divided.
     """
+    if scalars := [name for name, parameter in module.named_parameters() if parameter.ndim == 0]:
+        raise UserError(
+            f"training.sharding={FULL} divides parameters along their first dimension, found none in "
+            f"{', '.join(scalars)}: give them shape (1,), or set training.sharding={NONE}."
+        )
     # Here: a second that nobody else need wait.
     from torch.distributed import get_world_size, init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method

@@ -9,9 +9,12 @@ import torch
 from processes import Job, assert_close, launch, train
 from safetensors.torch import load_file
 from synthetic import write_demonstrations
+from torch import nn
 
+from imfvla.errors import UserError
 from imfvla.run_directory import RunDirectory
 from imfvla.training.parallel import Alone
+from imfvla.training.sharding import shard
 
 SKIP = {"on_non_finite": "skip"}
 SHARDED = {"sharding": "full"}
@@ -63,6 +66,13 @@ def test_a_state_of_the_whole_goes_on_in_parts_and_back(runs):
 
 def test_a_batch_that_is_not_finite_is_left_out(runs):
     assert_close(runs / "skipping-sharded", runs / "skipping")
+
+
+def test_a_parameter_that_cannot_be_divided_is_told():
+    module = nn.Module()
+    module.scale = nn.Parameter(torch.ones(()))
+    with pytest.raises(UserError, match=r"sharding=full divides parameters .* found none in scale"):
+        shard(module, torch.device("cpu"))
 
 
 def test_a_policy_of_the_papers_scale_is_trained_in_parts(runs):
