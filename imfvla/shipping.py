@@ -11,14 +11,15 @@ from imfvla.run_directory import DONE, LAST, RunDirectory
 
 MAX_BYTES = 8_000_000  # of the weights
 THINNING = 10
+RECORDED = ("depth_attention.json",)  # what tools may have added to a run
 
 
 def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
     """Fills `target`, which must not be there yet, and returns what made_by.json says.
 
-    Taken are config and status, the last averaged weights, the metrics of every 10th logged step, and the episodes and
-    summaries of the reporting band. Raises UserError for an unfinished run, weights above 8 MB, no reported evaluation,
-    or a target that exists.
+    Taken are config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
+    summaries of the reporting band, and what `RECORDED` names. Raises UserError for an unfinished run, weights above
+    8 MB, no reported evaluation, or a target that exists.
     """
     if target.exists():
         raise UserError(f"{target} is there already: remove it first.")
@@ -36,7 +37,8 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     target.mkdir(parents=True)
     if with_weights:
         shutil.copytree(weights.parent, target / weights.parent.relative_to(run.path))
-    for name in ("config.yaml", "status.json"):
+    recorded = [name for name in RECORDED if (run.path / name).exists()]
+    for name in ("config.yaml", "status.json", *recorded):
         shutil.copy2(run.path / name, target / name)
     rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
     write_text(target / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))

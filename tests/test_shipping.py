@@ -78,7 +78,9 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
 
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
     run = make_run(tmp_path / "run", size=8_000_001)
+    write_json(run.path / "depth_attention.json", {})
     ship(run, tmp_path / "results", with_weights=False)
+    assert (tmp_path / "results" / "depth_attention.json").is_file()
     assert not list(tmp_path.glob("results/**/*.safetensors"))
     assert (tmp_path / "results" / "rollouts" / "reported" / "episodes.jsonl").is_file()
 
