@@ -3,7 +3,7 @@
 python tools/campaign.py                        conf/sweep/campaign.yaml, one policy after the other
 python tools/campaign.py --side-by-side 2       two at a time, each with one thread and one worker
 python tools/campaign.py --list                 the commands, and which of them are done
-python tools/campaign.py --only transfer_dit    policies whose run directory has this in its name
+python tools/campaign.py --only transfer_dit    policies whose run directory is called so, or has this in its name
 python tools/campaign.py --commit               commits each result as soon as it is there
 
 A policy is done when experiments/results has every evaluation that the sweep asks for, made with the same config; so a
@@ -68,13 +68,15 @@ class Policy:
 
 
 def policies(sweep: str, only: str = "", results: Path = RESULTS) -> list[Policy]:
-    """The policies of conf/sweep/<sweep>.yaml whose name contains `only`, in its order. UserError where none does."""
+    """The policies of conf/sweep/<sweep>.yaml called `only`, else those whose names contain it; UserError where none does."""
     register_resolvers()
     jobs: dict[Path, list[Planned]] = {}
     for job in planned_jobs("train", [f"+sweep={sweep}"]):
         jobs.setdefault(job.directory, []).append(job)
     found = [Policy(directory, tuple(own), results) for directory, own in jobs.items()]
-    chosen = [policy for policy in found if only in policy.name]
+    chosen = [policy for policy in found if only == policy.name] or [
+        policy for policy in found if only in policy.name
+    ]
     if not chosen:
         names = ", ".join(policy.name for policy in found)
         raise UserError(f"--only {only} fits none of the policies of {sweep}: {names}.")
@@ -171,7 +173,7 @@ def commit(policy: Policy, made_by: dict[str, object]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--sweep", default="campaign", help="file of conf/sweep")
-    parser.add_argument("--only", default="", help="part of the names of run directories")
+    parser.add_argument("--only", default="", help="a run directory's name, or a part of several")
     parser.add_argument("--side-by-side", type=int, default=1, choices=range(1, 65), metavar="N")
     parser.add_argument("--commit", action="store_true", help="commit each result")
     parser.add_argument("--list", action="store_true", help="run nothing")
