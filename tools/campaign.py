@@ -68,7 +68,7 @@ class Policy:
 
 
 def policies(sweep: str, only: str = "", results: Path = RESULTS) -> list[Policy]:
-    """The policies of conf/sweep/<sweep>.yaml called `only`, else those whose names contain it; UserError where none does."""
+    """Of conf/sweep/<sweep>.yaml the policy called `only`, else those whose names contain it. UserError for none."""
     register_resolvers()
     jobs: dict[Path, list[Planned]] = {}
     for job in planned_jobs("train", [f"+sweep={sweep}"]):
