@@ -36,6 +36,8 @@ def main(config: dict[str, Any]) -> None:
         value = config[key]
         require(isinstance(value, int) and value >= 1, key, "a whole number of at least 1", value)
     parts = config["parts"]
+    scale = config["at_scale"]
+    require(scale in SCALES, "at_scale", f"one of {', '.join(SCALES)}", scale)
     require(bool(parts) and set(parts) <= set(PARTS), "parts", f"one or more of {', '.join(PARTS)}", parts)
     GlobalHydra.instance().clear()  # the experiments are composed below
     result: dict[str, Any] = {}
@@ -83,8 +85,8 @@ def evaluations(composed: Mapping[str, Any], config: Mapping[str, Any]) -> list[
 
 def measure_and_print(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
     """All figures of an experiment but its size."""
-    composed = compose("train", [f"+exp={experiment}", f"scale={config['scale']}", *config["overrides"]])
-    log.info("measuring %s at scale %s", experiment, config["scale"])
+    composed = compose("train", [f"+exp={experiment}", f"scale={config['at_scale']}", *config["overrides"]])
+    log.info("measuring %s at scale %s", experiment, config["at_scale"])
     with tempfile.TemporaryDirectory() as scratch:
         figures = measure(composed, config, Path(scratch))
     for table in tables_of(experiment, figures):

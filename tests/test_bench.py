@@ -28,7 +28,7 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
     monkeypatch.setattr("imfvla.benchmarks.training.GEMM", 64)
     main(
         [
-            "parts=[simulation,training,latency]",
+            "parts=[simulation,training,latency]", "at_scale=cpu",
             "experiments=[transfer_ph32_exec16]", "nfe=[1,3]", "training_steps=1", "latency_calls=5",
             "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in TOY)}]",
         ]
@@ -59,6 +59,7 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
             "parts=[speed]",
             "parts must be one or more of sizes, simulation, training, latency, found ['speed']",
         ),
+        ("at_scale=huge", "at_scale must be one of cpu, paper, found 'huge'"),
         ("sizes_of=some", "sizes_of must be all or a list of experiments, found 'some'"),
     ],
 )
