@@ -138,3 +138,8 @@ def train_all(jobs: list[Job]) -> None:
 
 if __name__ == "__main__":
     train_all([Job(**job) for job in json.loads(Path(sys.argv[1]).read_text())])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # All is written and the group is gone. What the interpreter takes down after that now and then aborts in gloo's
+    # threads ("terminate called without an active exception"), which torchrun would take for a failed training.
+    os._exit(0)
