@@ -11,6 +11,7 @@ N processes compute what one computes, each on its share of the rows of every ba
 So the state on disk does not depend on N, and a run goes on with another N.
 """
 
+import importlib
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -26,7 +27,7 @@ from torch.overrides import TorchFunctionMode
 
 from imfvla.errors import UserError
 from imfvla.training.options import TrainingOptions
-from imfvla.training.sharding import NONE, is_part
+from imfvla.training.sharding import NONE, forget_layouts, is_part
 from imfvla.types import Batch, Observation
 
 TIMEOUT = timedelta(days=1)  # others wait while process 0 collects demonstrations
@@ -148,12 +149,17 @@ def joined_processes(device: str) -> Iterator[Alone]:
         # torchrun keeps its store over a restart, and with it the addresses of the processes that are gone. On
         # several machines the number of restarts is not common knowledge; docs/reliability.md says what to do there.
         store = dist.PrefixStore(f"restart {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+    # A group that anything holds outlives destroy_process_group, and its threads the interpreter, which gloo's now and
+    # then abort. The functions of this module take the group of the moment as a default when they are imported, which
+    # the first optimiser does: imported here, they hold none.
+    importlib.import_module("torch.distributed.nn.functional")
     backend = "nccl" if on_gpu else "gloo"
     dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
     try:
         yield Shared(rank, size, local_size)
     finally:
         dist.destroy_process_group()
+        forget_layouts()
 
 
 def rows(batch: Batch, chosen: slice) -> Batch:

@@ -11,6 +11,8 @@
 - Files hold whole tensors under their usual names: whoever reads them need not know how they were trained.
 """
 
+import gc
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -87,3 +89,18 @@ def release(policy: nn.Module) -> None:
     """After a loss without a backward pass: the weights are in parts again. Of a whole policy nothing changes."""
     if reset := getattr(policy, "reset_iter_state", None):
         reset()
+
+
+def forget_layouts() -> None:
+    """After the last step in parts: empties PyTorch's caches of layouts, which hold the process group."""
+    if "torch.distributed.tensor" not in sys.modules:
+        return
+    from torch.distributed.tensor import _redistribute
+    from torch.distributed.tensor._collective_utils import MeshTopoInfo
+    from torch.distributed.tensor.debug import _clear_sharding_prop_cache
+
+    _redistribute.clear_redistribute_planner_cache()
+    _redistribute._gen_transform_infos.cache_clear()
+    MeshTopoInfo.build_from_mesh.cache_clear()
+    _clear_sharding_prop_cache()
+    gc.collect()  # policy and mesh refer to each other
