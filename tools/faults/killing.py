@@ -68,7 +68,7 @@ def is_cut(path: Path) -> bool:
 
 def progress_of(folder: Path) -> int:
     """Rows and recordings so far."""
-    total = len(list(folder.glob("*/*.mcap")))
+    total = sum(path.suffix == ".mcap" and path.parents[1] == folder for path in files_of(folder))
     for path in files_of(folder):
         if path.name == "metrics.jsonl" or (path.suffix == ".jsonl" and path.parents[1].name == "rollouts"):
             total += content(path).count(b"\n")
