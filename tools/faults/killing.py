@@ -68,9 +68,11 @@ def is_cut(path: Path) -> bool:
 
 def progress_of(folder: Path) -> int:
     """Rows and recordings so far."""
-    total = sum(path.suffix == ".mcap" and path.parents[1] == folder for path in files_of(folder))
+    total = 0
     for path in files_of(folder):
-        if path.name == "metrics.jsonl" or (path.suffix == ".jsonl" and path.parents[1].name == "rollouts"):
+        if path.suffix == ".mcap":
+            total += path.parents[1] == folder
+        elif path.name == "metrics.jsonl" or (path.suffix == ".jsonl" and path.parents[1].name == "rollouts"):
             total += content(path).count(b"\n")
     return total
 
