@@ -92,7 +92,7 @@ def release(policy: nn.Module) -> None:
 
 
 def forget_layouts() -> None:
-    """After the last step in parts: empties PyTorch's caches of layouts, which hold the process group."""
+    """After the last step in parts: empties PyTorch's caches of layouts, each of which holds the process group."""
     if "torch.distributed.tensor" not in sys.modules:
         return
     from torch.distributed.tensor import _redistribute
