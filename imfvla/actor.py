@@ -27,16 +27,23 @@ class ChunkActor:
 
     Cameras are looked at only in the steps that enter a decision. The noise of replanning k in the
     episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so every policy with equal
-    chunks sees the same noise.
+    chunks sees the same noise. It is multiplied by `noise_scale`.
     """
 
     def __init__(
-        self, policy: Policy, horizon: Horizon, nfe: int, noise_seed: int, device: torch.device | str = "cpu"
+        self,
+        policy: Policy,
+        horizon: Horizon,
+        nfe: int,
+        noise_seed: int,
+        device: torch.device | str = "cpu",
+        *,
+        noise_scale: float = 1.0,
     ) -> None:
         self._policy = policy.eval()
         self._horizon = horizon
         self._nfe = nfe
-        self._noise_seed = noise_seed
+        self._noise_seed, self._noise_scale = noise_seed, noise_scale
         self._device = torch.device(device)
 
     def reset(self, env: Any, seed: int) -> None:
@@ -96,7 +103,8 @@ class ChunkActor:
             instruction=self._instruction,
         )
         draw = np.random.default_rng(np.random.SeedSequence([self._noise_seed, self._seed, replanning]))
-        noise = torch.from_numpy(draw.standard_normal(self._policy.noise_shape, dtype=np.float32))
+        normal = draw.standard_normal(self._policy.noise_shape, dtype=np.float32)
+        noise = self._noise_scale * torch.from_numpy(normal)
         chunk = self._policy.predict(observation, noise.unsqueeze(0).to(self._device), self._nfe)
         answer = chunk[0].float().cpu().numpy()  # waits for an accelerator
         return answer, 1e3 * (time.perf_counter() - began)

@@ -20,6 +20,7 @@ PROTOCOL_KEYS = (
     "first_seed",
     "episodes",
     "noise_seed",
+    "noise_scale",
     "device",
 )  # of `evaluation`, as a protocol names them
 

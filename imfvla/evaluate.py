@@ -23,9 +23,14 @@ def _evaluate(config: dict[str, Any]) -> None:
         require(_is_whole(config[key]), key, "a whole number", config[key])
     for key in ("workers", "max_steps"):
         require(config[key] is None or _is_whole(config[key]), key, "null or a whole number", config[key])
+    require(_is_number(config["noise_scale"]), "noise_scale", "a number", config["noise_scale"])
     timeout_s = config["episode_timeout_s"]
-    is_number = _is_whole(timeout_s) or isinstance(timeout_s, float)
-    require(timeout_s is None or is_number, "episode_timeout_s", "null or a number of seconds", timeout_s)
+    require(
+        timeout_s is None or _is_number(timeout_s),
+        "episode_timeout_s",
+        "null or a number of seconds",
+        timeout_s,
+    )
     run = RunDirectory(config["run"])
     options = {key: value for key, value in config.items() if key not in ("run", "nfe")}
     summaries = evaluate(run, nfe=read_nfe(config["nfe"]), **options)
@@ -74,6 +79,10 @@ def read_nfe(value: Any) -> list[int]:
         value,
     )
     return numbers
+
+
+def _is_number(value: Any) -> bool:
+    return _is_whole(value) or isinstance(value, float)
 
 
 def _is_whole(value: Any) -> bool:

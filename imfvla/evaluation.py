@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from imfvla.errors import UserError
 from imfvla.fingerprint import fingerprint, physical_cores
 from imfvla.options import require
 from imfvla.progress import Progress
+from imfvla.protocol import USUAL_NOISE, Protocol
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory, flatten
@@ -18,37 +19,6 @@ from imfvla.workbench import Build, Job, gl_renderer, load_workbench, record, ro
 from imfvla.workers import Here, Pool, worker_pool
 
 REQUIRED_KEYS = ("name", "task.name", "task.variant", "observation.views", "observation.image_size")
-
-
-@dataclass(frozen=True, slots=True)
-class Protocol:
-    """What an evaluation's rows depend on, beside the code: equal protocols give equal rows but for times."""
-
-    task: str
-    variant: str
-    checkpoint_step: int
-    weights: str  # first 16 hex digits of the SHA-256 of the weights
-    nfe: int
-    noise_seed: int
-    first_seed: int
-    episodes: int
-    max_steps: int | None  # control steps of an episode, None for all of them
-    device: str  # "cpu" or "cuda", where the policy computes
-
-    @property
-    def seeds(self) -> range:
-        return range(self.first_seed, self.first_seed + self.episodes)
-
-    def name(self, last_step: int) -> str:
-        """The folder in `rollouts/`: seeds and nfe, and what is unusual where the weights of `last_step` are usual."""
-        unusual = {
-            f"_step{self.checkpoint_step}": self.checkpoint_step != last_step,
-            f"_noise{self.noise_seed}": self.noise_seed != 0,
-            f"_max{self.max_steps}": self.max_steps is not None,
-            f"_{self.device}": self.device != "cpu",
-        }
-        suffixes = "".join(text for text, applies in unusual.items() if applies)
-        return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{suffixes}"
 
 
 def evaluate(
@@ -61,6 +31,7 @@ def evaluate(
     episode_timeout_s: float | None = None,
     checkpoint: int | str = "last",
     noise_seed: int = 0,
+    noise_scale: float = USUAL_NOISE,
     max_steps: int | None = None,
     device: str = "cpu",
     recordings: bool = True,
@@ -79,6 +50,7 @@ def evaluate(
       episode_timeout_s: an episode that takes a worker longer is played again by a fresh one; None: no limit.
       checkpoint: training step of the weights, or "last".
       noise_seed: of the noise streams; equal for policies that are to be compared.
+      noise_scale: of the noise that a chunk starts from, in 0 ... 1; below 1 samples are nearer to each other.
       max_steps: control steps of an episode, None for all.
       device: where the policy computes: "cpu" or "cuda".
       build: makes environment and policy, in each worker once.
@@ -100,6 +72,7 @@ def evaluate(
         "null or above 0",
         episode_timeout_s,
     )
+    require(0 <= noise_scale <= 1, "noise_scale", "in 0 ... 1", noise_scale)
     require(max_steps is None or max_steps >= 1, "max_steps", "null or at least 1", max_steps)
     require(device in ("cpu", "cuda"), "device", "cpu or cuda", device)
     require(
@@ -128,12 +101,13 @@ def evaluate(
                 weights=digest,
                 nfe=number,
                 noise_seed=noise_seed,
+                noise_scale=float(noise_scale),
                 first_seed=first_seed,
                 episodes=episodes,
                 max_steps=max_steps,
                 device=device,
             )
-            job = Job(build, run.path, step, number, noise_seed, max_steps, device)
+            job = Job(build, run.path, step, number, noise_seed, protocol.noise_scale, max_steps, device)
             name = protocol.name(run.weight_steps()[-1])
             with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=overwrite) as rollouts:
                 if rollouts.summary is None:

@@ -40,6 +40,7 @@ class EvaluationOptions:
     nfe: tuple[int, ...]
     checkpoint: str
     noise_seed: int
+    noise_scale: float
     device: str
     workers: int | None
     episode_timeout_s: float | None
@@ -47,6 +48,7 @@ class EvaluationOptions:
     def __post_init__(self) -> None:
         require(self.episodes >= 1, "evaluation.episodes", "at least 1", self.episodes)
         require(self.first_seed >= 0, "evaluation.first_seed", "at least 0", self.first_seed)
+        require(0 <= self.noise_scale <= 1, "evaluation.noise_scale", "in 0 ... 1", self.noise_scale)
         require(bool(self.nfe), "evaluation.nfe", "one or more numbers of evaluations", self.nfe)
 
 

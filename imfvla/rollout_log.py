@@ -14,6 +14,7 @@ from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, write_json, write_text
 from imfvla.fingerprint import code_version
+from imfvla.protocol import as_recorded
 from imfvla.reporting.episodes import read_row
 from imfvla.reporting.metrics import Row
 
@@ -84,7 +85,8 @@ class RolloutLog:
         if not path.exists():
             return None
         summary = read_json(path, "delete it and evaluate again", mapping=True)
-        if summary.get("protocol") == self._protocol:
+        recorded = summary.get("protocol")
+        if isinstance(recorded, dict) and as_recorded(recorded) == self._protocol:
             log.info("%s is finished already; overwrite=true repeats it.", self.path)
             return summary
         log.info("%s was made with another policy or protocol and is replaced.", self.path)

@@ -28,6 +28,7 @@ class Job:
     step: int
     nfe: int
     noise_seed: int
+    noise_scale: float
     max_steps: int | None
     device: str  # of the policy
 
@@ -87,7 +88,14 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
     env, policy = _bench(job.build, job.run, job.step)
-    actor = ChunkActor(policy.to(job.device), policy.horizon, job.nfe, job.noise_seed, job.device)
+    actor = ChunkActor(
+        policy.to(job.device),
+        policy.horizon,
+        job.nfe,
+        job.noise_seed,
+        job.device,
+        noise_scale=job.noise_scale,
+    )
     config = RunDirectory(job.run).config() if sinks else {}
     metadata = {"policy": str(config.get("name", "")), "nfe": job.nfe, "checkpoint_step": job.step}
     threads = torch.get_num_threads()

@@ -17,9 +17,11 @@ horizons = st.integers(1, 5).flatmap(
 )
 
 
-def play(policy: KnownPolicy, *, num_steps: int = 30, seed: int = 5, nfe: int = 2, noise_seed: int = 0):
+def play(
+    policy: KnownPolicy, *, num_steps: int = 30, seed: int = 5, nfe: int = 2, noise_seed: int = 0, **options
+):
     env = FakeEnvironment(num_steps)
-    actor = ChunkActor(policy, policy.horizon, nfe, noise_seed)
+    actor = ChunkActor(policy, policy.horizon, nfe, noise_seed, **options)
     result = run_episode(env, actor, seed, [], kind="rollout", config={})
     return env, result
 
@@ -70,6 +72,7 @@ def test_noise_depends_on_noise_seed_episode_and_replanning_alone():
     assert not np.array_equal(reference[0], noises(noise_seed=1)[0])
     draw = np.random.default_rng(np.random.SeedSequence([0, 5, 1])).standard_normal((8, 16), dtype=np.float32)
     np.testing.assert_array_equal(reference[1], draw)
+    np.testing.assert_array_equal(0.5 * np.array(reference), noises(noise_scale=0.5))
 
 
 def test_actions_are_clipped_to_the_limits():

@@ -209,10 +209,18 @@ def test_a_run_without_weights_is_named(run):
 
 
 def test_other_weights_noise_and_lengths_have_folders_of_their_own(run):
-    (summary,) = roll(run, checkpoint=10, noise_seed=3, max_steps=5)
-    assert summary["name"] == "seeds100000-100005_nfe1_step10_noise3_max5"
+    (summary,) = roll(run, checkpoint=10, noise_seed=3, noise_scale=0.5, max_steps=5)
+    assert summary["name"] == "seeds100000-100005_nfe1_step10_noise3_scale0.5_max5"
     assert summary["protocol"]["weights"] != roll(run)[0]["protocol"]["weights"]
     assert sorted(path.name for path in run.path.glob("rollouts/*")) == [NAME, summary["name"]]
+
+
+def test_an_evaluation_from_before_noise_had_a_scale_is_not_repeated(run):
+    (summary,) = roll(run)
+    path = run.rollouts(NAME) / "summary.json"
+    del summary["protocol"]["noise_scale"]
+    path.write_text(json.dumps(summary))
+    assert roll(run) == [summary]
 
 
 @pytest.mark.parametrize("workers", [0, 1])

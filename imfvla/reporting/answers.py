@@ -121,9 +121,9 @@ def check_equal_protocols(answers: Sequence[Answer]) -> None:
 
 
 def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
-    """Whether it is of the row's policy, weights and number of evaluations."""
+    """Whether it is of the row's policy, weights and number of evaluations, with noise as in training."""
     policy = (evaluation.experiment, evaluation.key, evaluation.nfe)
-    if policy != (row.experiment, row.run, row.nfe):
+    if policy != (row.experiment, row.run, row.nfe) or not evaluation.is_usual:
         return False
     return evaluation.summary["checkpoint_step"] == row.step(evaluation.training_steps)
 

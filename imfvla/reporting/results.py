@@ -50,7 +50,7 @@ class Result:
 
     @property
     def policy(self) -> str:
-        """Experiment and overrides, the training seed apart."""
+        """Experiment and overrides, the training seed apart, and the noise where it is unusual."""
         if self.row:
             return f"{self.row.experiment}/{self.row.run}" if self.row.run else self.row.experiment
         return self.evaluated[0].evaluation.label

@@ -7,6 +7,7 @@ from typing import Any
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
+from imfvla.protocol import USUAL_NOISE, as_recorded
 from imfvla.reporting.mapping import TableRow, read_mapping, run_key
 from imfvla.run_directory import RunDirectory, training_steps
 
@@ -28,7 +29,7 @@ class Evaluation:
 
     run: Path
     folder: Path
-    summary: dict[str, Any]  # `summary.json`, every metric in it
+    summary: dict[str, Any]  # `summary.json`, every metric in it, its protocol completed
     config: dict[str, Any]  # `config.yaml` of the run
 
     @property
@@ -40,13 +41,23 @@ class Evaluation:
         return self.summary["nfe"]
 
     @property
+    def noise_scale(self) -> float:
+        return self.summary["protocol"]["noise_scale"]
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether chunks started from noise as in training, as in all rows of the tables."""
+        return self.noise_scale == USUAL_NOISE
+
+    @property
     def key(self) -> str:
         """The overrides in the name of the run directory, its training seed apart; "" for none."""
         return key_of(self.run, self.experiment)
 
     @property
     def label(self) -> str:
-        return f"{self.experiment}/{self.key}" if self.key else self.experiment
+        policy = f"{self.experiment}/{self.key}" if self.key else self.experiment
+        return policy if self.is_usual else f"{policy}, noise {self.noise_scale:g}"
 
     @property
     def training_seed(self) -> int:
@@ -66,7 +77,7 @@ class Evaluation:
     @property
     def row(self) -> TableRow | None:
         """The row of the tables with the same policy and nfe, of whichever checkpoint."""
-        return read_mapping().find(self.experiment, self.key, self.nfe)
+        return read_mapping().find(self.experiment, self.key, self.nfe) if self.is_usual else None
 
     @property
     def is_reporting(self) -> bool:
@@ -94,7 +105,8 @@ def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list
 def rows(run: RunDirectory) -> list[Evaluation]:
     """The evaluations that stand for a run by itself, one for each nfe, ascending.
 
-    Of several: whole episodes of the reporting band before others, then later weights, then more episodes.
+    Of several: whole episodes of the reporting band before others, then the usual noise, then later weights, then more
+    episodes.
 
     Raises:
       UserError: the directory holds no run, no finished evaluation, or a broken summary.
@@ -118,9 +130,9 @@ def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
     return [RunDirectory(path) for path in found]
 
 
-def _rank(evaluation: Evaluation) -> tuple[bool, int, int]:
+def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
     summary = evaluation.summary
-    return evaluation.is_reporting, summary["checkpoint_step"], summary["episodes"]
+    return evaluation.is_reporting, evaluation.is_usual, summary["checkpoint_step"], summary["episodes"]
 
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
@@ -135,4 +147,5 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
     seeds = summary["seeds"]
     if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
         raise UserError(f"{path}: seeds must be the first and the last one, found {seeds!r}{REMEDY}.")
+    summary |= {"protocol": as_recorded(summary["protocol"])}
     return Evaluation(run.path, folder, summary, config)

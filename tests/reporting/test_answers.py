@@ -11,6 +11,8 @@ from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.runs import rows
+from imfvla.run_directory import RunDirectory
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
@@ -31,7 +33,7 @@ def test_a_row_is_answered_by_its_policy_weights_and_evaluations(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["socket_infer1", "socket_l1", "socket_ddim_infer10", "transfer_flow_infer2"]
+    "name", ["socket_infer1", "socket_infer2", "socket_ddim_infer10", "socket_l1", "transfer_flow_infer2"]
 )
 def test_no_other_row_is_answered_by_the_same_run(tmp_path, name):
     answer_row(tmp_path, ROWS[name])
@@ -45,6 +47,18 @@ def test_runs_with_other_overrides_and_seeds_of_selection_answer_nothing(tmp_pat
     write_evaluation(make_run(tmp_path / name / "default", name), 2, first_seed=10_000)
     write_evaluation(make_run(tmp_path / name / "default", name), 2, number=100, max_steps=50)
     assert answer("socket_infer2", tmp_path).is_missing
+
+
+def test_a_run_stands_for_itself_with_the_usual_noise_and_each_noise_is_listed(tmp_path):
+    name = "socket_ph32_exec16"
+    run = make_run(tmp_path / name / "default", name)
+    for noise in ({}, {"noise_scale": 0.5}, {"noise_scale": 0.0}):
+        write_evaluation(run, 2, number=100, **noise)
+    assert [found.noise_scale for found in rows(RunDirectory(run))] == [1.0]
+    in_row = answer("socket_infer2", tmp_path)
+    assert [found.evaluation.noise_scale for found in in_row.evaluated] == [1.0]
+    others = Sources([tmp_path]).others([in_row])
+    assert [found.evaluation.label for found in others] == [f"{name}, noise 0", f"{name}, noise 0.5"]
 
 
 def test_a_later_directory_counts_alone(tmp_path):
