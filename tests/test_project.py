@@ -83,6 +83,7 @@ def test_commands_in_documents_compose_and_build(command):
 MAY_IMPORT = {
     "episode": set(),
     "horizon": set(),
+    "protocol": set(),
     "nn": {"torch"},
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn"},
@@ -91,7 +92,7 @@ MAY_IMPORT = {
     "policy": {"torch", "chunks", "construction", "generators", "horizon", "nn", "statistics", "types"},
     "tasks": {"mujoco", "dm_control", "episode", "gl"},
     "recording": {"documents", "episode"},
-    "reporting": {"documents", "episode", "files", "options", "run_directory"},
+    "reporting": {"documents", "episode", "files", "options", "protocol", "run_directory"},
     "figures": {"documents", "reporting"},
     "data": {"torch", "documents", "files", "horizon", "instruction", "recording", "statistics", "types"},
 }
