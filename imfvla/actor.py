@@ -14,6 +14,7 @@ from imfvla.episode import Decision
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
+from imfvla.protocol import USUAL_NOISE
 from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.types import Observation
 
@@ -38,7 +39,7 @@ class ChunkActor:
         noise_seed: int,
         device: torch.device | str = "cpu",
         *,
-        noise_scale: float = 1.0,
+        noise_scale: float = USUAL_NOISE,
     ) -> None:
         self._policy = policy.eval()
         self._horizon = horizon

@@ -57,6 +57,7 @@ def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
                 axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center", fontsize=6.5,
                           color="white" if dark else INK)  # fmt: skip
         left += shares
-    axes.set_yticks(places, [result.name for result in results], fontsize=7)
+    names = [result.name.replace(", ", ",\n", 1) for result in results]  # of rows in no table: two lines
+    axes.set_yticks(places, names, fontsize=7)
     axes.set_ylim(len(results) - 0.4, -0.6)
     legend_below(axes, columns=3)

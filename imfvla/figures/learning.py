@@ -29,11 +29,14 @@ def learning_curves(results: Sequence[Result]) -> Figure:
 
 
 def _curves(results: Sequence[Result]) -> dict:
-    """Steps and losses of each run, by policy and training seed."""
-    found = {}
+    """Steps and losses of each run, by policy and training seed; of a run's several evaluations the first names it."""
+    found, read = {}, set()
     for result in results:
         for evaluated in result.evaluated:
             evaluation = evaluated.evaluation
+            if evaluation.run in read:
+                continue
+            read.add(evaluation.run)
             seed = f", seed {evaluation.training_seed}" if evaluation.training_seed else ""
             steps, loss = learning_curve(evaluation.run)
             if steps.size:
