@@ -37,7 +37,7 @@ def failed_stages(results: Sequence[Result]) -> Figure:
 
 
 def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
-    axes.set_xlabel("episodes [%], by the first stage that failed")
+    axes.set_xlabel("episodes [%], by first failed stage")
     axes.set_xlim(0, 100)
     axes.grid(axis="y", visible=False)
     if not results:
