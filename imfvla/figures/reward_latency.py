@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Affine2D, Bbox
 
 from imfvla.figures.panels import plain_log_ticks
 from imfvla.figures.style import BLACK, CYCLE, GREY, MARKERS, new_figure, style
@@ -14,13 +15,15 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.results import Result
 
+LABEL_HEIGHTS = (-2, 7, -11, 15, -19, 23, -27)  # points above the middle of a marker
+
 
 @dataclass(frozen=True, slots=True)
 class Point:
     """A policy with a number of evaluations: the lower and the further up, the better."""
 
     method: str
-    label: str
+    label: str  # number of network evaluations, "" where the paper does not say it
     latency_ms: float
     reward: Measured
 
@@ -41,7 +44,14 @@ def reward_latency(results: Sequence[Result]) -> Figure:
         handles = {
             handle.get_label(): handle for axis in axes for handle in axis.get_legend_handles_labels()[0]
         }
-        figure.legend(handles.values(), handles, loc="outside lower center", ncols=min(len(handles), 4))
+        figure.legend(
+            handles.values(),
+            handles,
+            loc="outside lower center",
+            ncols=min(len(handles), 4),
+            title="beside points: network evaluations of a chunk",
+            title_fontsize=8,
+        )
         figure.draw_without_rendering()  # places of labels are measured on the final layout
         for axis, points in zip(axes, (printed, ours), strict=True):
             _write_labels(axis, [p for p in points if p], methods)
@@ -60,9 +70,9 @@ def pareto_frontier(points: Sequence[tuple[float, float]]) -> list[tuple[float, 
 def _printed(paper: PaperRow | None) -> Point | None:
     if paper is None or paper.latency_ms is None:
         return None
-    evaluations = re.match(r"infer\d+", paper.setting)
+    evaluations = re.match(r"infer(\d+)", paper.setting)
     return Point(
-        paper.method, evaluations.group() if evaluations else "", paper.latency_ms, Measured(paper.avg_reward)
+        paper.method, evaluations[1] if evaluations else "", paper.latency_ms, Measured(paper.avg_reward)
     )
 
 
@@ -70,7 +80,7 @@ def _ours(result: Result) -> Point | None:
     latency, reward = result.metrics["inference_ms_mean"], result.metrics["avg_return"]
     if latency.value is None:
         return None
-    return Point(result.row.method, f"infer{result.row.nfe}", latency.value, reward)
+    return Point(result.row.method, str(result.row.nfe), latency.value, reward)
 
 
 def _panel(axes: Axes, title: str, points: Sequence[Point], methods: Sequence[str]) -> None:
@@ -107,16 +117,29 @@ def errors(measured: Sequence[Measured]) -> np.ndarray:
 
 
 def _write_labels(axes: Axes, points: Sequence[Point], methods: Sequence[str]) -> None:
-    """Right of each point, or below where it would hide the label of a higher one."""
-    taken: list[np.ndarray] = []
+    """Beside each point, at the first place where it hides no label or interval, or the fewest."""
+    scale = 72 / axes.figure.dpi
+    frame = axes.bbox.transformed(Affine2D().scale(scale))
+    taken = [_extent(axes, point).transformed(Affine2D().scale(scale)) for point in points]
     for point in sorted(points, key=lambda point: -point.reward.value):
-        at = axes.transData.transform((point.latency_ms, point.reward.value)) * 72 / axes.figure.dpi
-        offsets = [(7, 1), (7, -8), (7, -16), (-34, 1), (-34, -9), (7, -25), (7, 10)]
-        free = [o for o in offsets if all(np.any(np.abs(at + o - t) > (32, 8)) for t in taken)] or offsets[:1]
-        taken.append(at + free[0])
+        x, y = axes.transData.transform((point.latency_ms, point.reward.value)) * scale
+        width = 5 * len(point.label)
+        places = [(side, up) for up in LABEL_HEIGHTS for side in (6, -6 - width)]
+        boxes = {at: Bbox.from_bounds(x + at[0], y + at[1] - 1, width, 8) for at in places}
+        inside = {at: box for at, box in boxes.items() if frame.x0 < box.x0 and box.x1 < frame.x1} or boxes
+        best = min(inside, key=lambda at: inside[at].count_overlaps(taken))
+        taken.append(inside[best])
         place = (point.latency_ms, point.reward.value)
         color = _look(point.method, methods)[0]
-        axes.annotate(point.label, place, free[0], textcoords="offset points", fontsize=7, color=color)
+        axes.annotate(point.label, place, best, textcoords="offset points", fontsize=7, color=color)
+
+
+def _extent(axes: Axes, point: Point) -> Bbox:
+    """What the marker and interval of `point` cover [pixels]."""
+    low, high = point.reward.low, point.reward.high
+    ends = [point.reward.value if end is None else end for end in (low, high)]
+    corners = axes.transData.transform([(point.latency_ms, end) for end in ends])
+    return Bbox(corners).padded(4)
 
 
 def _look(method: str, methods: Sequence[str]) -> tuple[str, str]:

@@ -55,9 +55,13 @@ class Evaluation:
         return key_of(self.run, self.experiment)
 
     @property
+    def policy(self) -> str:
+        """What was trained, the seed apart."""
+        return f"{self.experiment}/{self.key}" if self.key else self.experiment
+
+    @property
     def label(self) -> str:
-        policy = f"{self.experiment}/{self.key}" if self.key else self.experiment
-        return policy if self.is_usual else f"{policy}, noise {self.noise_scale:g}"
+        return self.policy if self.is_usual else f"{self.policy}, noise {self.noise_scale:g}"
 
     @property
     def training_seed(self) -> int:
