@@ -1,7 +1,9 @@
 """Where episodes end: a histogram of the first stage that was not reached, one panel a task."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,7 +32,8 @@ def failed_stages(results: Sequence[Result]) -> Figure:
     measured = [result for result in results if not result.is_missing]
     rows = {task: [result for result in measured if result.task == task] for task in TASKS}
     with style():
-        figure, axes = task_panels(1.4 + 0.24 * max(map(len, rows.values())), 2)
+        lines = max((_name(result).count("\n") + 1 for result in measured), default=1)
+        figure, axes = task_panels(1.4 + (0.14 + 0.08 * lines) * max(map(len, rows.values())), 2)
         for task, axis in axes.items():
             _bars(axis, STAGES[task], rows[task])
     return figure
@@ -57,7 +60,14 @@ def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
                 axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center", fontsize=6.5,
                           color="white" if dark else INK)  # fmt: skip
         left += shares
-    names = [result.name.replace(", ", ",\n", 1) for result in results]  # of rows in no table: two lines
-    axes.set_yticks(places, names, fontsize=7)
+    axes.set_yticks(places, [_name(result) for result in results], fontsize=7)
     axes.set_ylim(len(results) - 0.4, -0.6)
     legend_below(axes, columns=3)
+
+
+def _name(result: Result) -> str:
+    """In short lines where it stands in no table, since it is long then, and without the training's last step."""
+    if result.row:
+        return result.name
+    name = f"{result.policy}, infer{result.nfe}" if result.is_last else result.name
+    return "\n".join(wrap(re.sub("[/,] ?", ", ", name), 36))
