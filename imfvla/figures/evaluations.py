@@ -42,10 +42,10 @@ def _panel(axes: Axes, lines: Sequence[Sequence[Result]]) -> None:
         shares = [result.metrics["success_share"].scaled(100) for result in line]
         shift = 1 + 0.02 * (number - (len(lines) - 1) / 2)  # so that intervals do not hide each other
         x, y = [shift * result.nfe for result in line], [share.value for share in shares]
-        style = look(trainings.index(evaluation.policy))
+        how = look(trainings.index(evaluation.policy))
         if not evaluation.is_usual:
-            style |= {"linestyle": "--", "markerfacecolor": "white"}
-        axes.errorbar(x, y, yerr=errors(shares), capsize=2.5, label=evaluation.label, **style)
+            how |= {"linestyle": "--", "markerfacecolor": "white"}
+        axes.errorbar(x, y, yerr=errors(shares), capsize=2.5, label=evaluation.label, **how)
     if not lines:
         say_nothing_yet(axes, "no policy measured with several numbers yet")
     lowest = axes.dataLim.y0 if lines else 0

@@ -95,6 +95,7 @@ def test_weights_at_the_end_of_training_are_compared_over_evaluations(results):
     assert lines["socket_ph32_exec16"] == 2  # one evaluation is answered by a third of the training
     assert lines["socket_ddpm_ph32_exec16"] == 4
     assert lines["socket_ph32_exec16/generator=flow_high_noise"] == 3
+    assert "socket_act" not in lines  # a single evaluation is no line
 
 
 def test_a_learning_curve_without_its_cut_off_last_line(tmp_path):
