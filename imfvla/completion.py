@@ -31,8 +31,8 @@ def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
     False where its files cannot be read: running it then says why.
     """
     try:
-        weights = RunDirectory(directory).policy_weights(config["evaluation"]["checkpoint"])
-        return _has_evaluations(config, directory, int(weights.parent.name.removeprefix("step-")))
+        step = RunDirectory(directory).weights_step(config["evaluation"]["checkpoint"])
+        return _has_evaluations(config, directory, step)
     except (UserError, TypeError, KeyError):
         return False
 

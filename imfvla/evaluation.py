@@ -85,10 +85,10 @@ def evaluate(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
     run.refuse_links_outside()
-    weights = run.policy_weights(checkpoint)
+    step = run.weights_step(checkpoint)
+    weights = run.policy_weights(step)
     if not weights.exists():
         raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
-    step = int(weights.parent.name.removeprefix("step-"))
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     count = physical_cores() if workers is None else workers
     summaries = []

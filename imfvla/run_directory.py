@@ -78,9 +78,13 @@ class RunDirectory:
         return sorted(int(match.group(1)) for match in found if match)
 
     def policy_weights(self, step: int | str = LAST) -> Path:
-        """`policy.safetensors` of a step, of the last one kept, or of a share of the training such as "1/3".
+        """`policy.safetensors` of what `weights_step` takes."""
+        return self.weights_directory(self.weights_step(step)) / "policy.safetensors"
 
-        Raises UserError where there is none.
+    def weights_step(self, step: int | str = LAST) -> int:
+        """The training step of kept weights: of a step, of the last one, or of a share of the training such as "1/3".
+
+        Raises UserError where there are none.
         """
         steps = self.weight_steps()
         if not steps:
@@ -96,7 +100,7 @@ class RunDirectory:
             raise UserError(
                 f"{self.checkpoints} has no weights of step {step!r}: kept are {kept}, or take last."
             )
-        return self.weights_directory(int(step)) / "policy.safetensors"
+        return int(step)
 
     def config(self) -> dict[str, Any]:
         """The resolved config of the run. Raises UserError where there is none or the file is broken."""

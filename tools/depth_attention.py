@@ -30,7 +30,7 @@ def main() -> int:
     try:
         directory = RunDirectory(arguments.run)
         checkpoint = int(arguments.checkpoint) if arguments.checkpoint.isdecimal() else arguments.checkpoint
-        step = int(directory.policy_weights(checkpoint).parent.name.removeprefix("step-"))
+        step = directory.weights_step(checkpoint)
         env, policy = load_workbench(arguments.run, step)
         found = measure_depth_attention(
             env, policy, seed=arguments.seed, nfe=arguments.nfe, max_steps=arguments.max_steps

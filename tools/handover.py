@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from imfvla.actor import ChunkActor
-from imfvla.episode import EpisodeInfo, EpisodeResult, Step
+from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.progress import Progress
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
 from imfvla.workbench import load_workbench
 
-LEFT, RIGHT = 7, 15  # grippers within an action: 0 is closed, 1 open
+LEFT, RIGHT = (ACTION_NAMES.index(f"{arm}/gripper") for arm in ("left", "right"))  # 0 is closed, 1 open
 MIDDLE = 0.5
 
 
@@ -59,9 +59,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
     try:
-        directory = RunDirectory(arguments.run)
-        step = int(directory.policy_weights().parent.name.removeprefix("step-"))
-        env, policy = load_workbench(arguments.run, step)
+        env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())
         log, delays = ActionLog(), {True: Counter(), False: Counter()}
         actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
         with Progress("hand-overs", arguments.episodes) as progress:

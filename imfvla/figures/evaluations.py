@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from imfvla.figures.panels import legend_below, look, say_nothing_yet, task_panels
+from imfvla.figures.panels import TASKS, legend_below, look, say_nothing_yet, task_panels
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import style
 from imfvla.reporting.results import Result
@@ -22,7 +22,7 @@ def success_by_evaluations(results: Sequence[Result]) -> Figure:
     last = sorted((result for result in results if result.is_last), key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]
-    by_task = {task: [line for line in lines if line[0].task == task] for task in ("socket", "transfer")}
+    by_task = {task: [line for line in lines if line[0].task == task] for task in TASKS}
     most = max(map(len, by_task.values()))
     with style():
         figure, axes = task_panels(3.8, most)
