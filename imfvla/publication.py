@@ -70,7 +70,7 @@ def publish(
     for number in TABLES:
         check_equal_protocols([answer for answer in answers if answer.row.table == number])
     results = [Result.of(answer) for answer in answers]
-    others = [Result([found]) for found in sources.others(answers)]
+    others = [Result(found) for found in sources.others(answers)]
     if all(result.is_missing for result in results) and not others:
         raise UserError(
             f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "

@@ -94,7 +94,7 @@ def untimed_table(directory: Path) -> list[dict[str, str]]:
     from imfvla.reporting.results import Result
     from imfvla.reporting.tables import other_table
 
-    table = other_table([Result([found]) for found in Sources([directory / "runs"]).others([])]).data
+    table = other_table([Result(found) for found in Sources([directory / "runs"]).others([])]).data
     named = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
     return [
         {key: value for key, value in row.items() if not any(name in key for name in TIMES)} for row in named

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from math import isclose
 from pathlib import Path
 from typing import Any
@@ -93,8 +93,11 @@ class Sources:
         train = f"python -m imfvla.train +exp={row.experiment}{overrides} 'evaluation.nfe=[{counts}]'"
         return train if row.checkpoint == LAST else f"{train} && {_evaluate(row, Path(directory))}"
 
-    def others(self, answers: Sequence[Answer]) -> list[Evaluated]:
-        """Evaluations of the reporting band that stand in no row, of a policy's several the last directory's."""
+    def others(self, answers: Sequence[Answer]) -> list[list[Evaluated]]:
+        """Evaluations of the reporting band that stand in no row; those of all training seeds together.
+
+        Of a policy's several the last directory's.
+        """
         taken = {found.evaluation.folder for answer in answers for found in answer.evaluated}
         answered = {_identity(found.evaluation) for answer in answers for found in answer.evaluated}
         chosen: dict[tuple, Evaluation] = {}
@@ -103,7 +106,10 @@ class Sources:
                 identity = _identity(evaluation)
                 if evaluation.folder not in taken and identity not in answered:
                     chosen[identity] = evaluation
-        return [read_evaluated(chosen[identity]) for identity in sorted(chosen)]
+        return [
+            [read_evaluated(chosen[identity]) for identity in identities]
+            for _, identities in groupby(sorted(chosen), key=lambda identity: identity[:-1])
+        ]
 
 
 def check_equal_protocols(answers: Sequence[Answer]) -> None:
@@ -200,7 +206,7 @@ def _identity(evaluation: Evaluation) -> tuple:
         evaluation.label,
         evaluation.nfe,
         summary["checkpoint_step"] == evaluation.training_steps,
-        evaluation.training_seed,
         summary["seeds"][0],
         summary["episodes"],
+        evaluation.training_seed,
     )

@@ -58,7 +58,7 @@ def test_a_run_stands_for_itself_with_the_usual_noise_and_each_noise_is_listed(t
     in_row = answer("socket_infer2", tmp_path)
     assert [found.evaluation.noise_scale for found in in_row.evaluated] == [1.0]
     others = Sources([tmp_path]).others([in_row])
-    assert [found.evaluation.label for found in others] == [f"{name}, noise 0", f"{name}, noise 0.5"]
+    assert [found.evaluation.label for [found] in others] == [f"{name}, noise 0", f"{name}, noise 0.5"]
 
 
 def test_a_later_directory_counts_alone(tmp_path):
@@ -182,7 +182,8 @@ def test_what_stands_in_no_row_is_listed(tmp_path):
     folder = answer_row(tmp_path, ROWS["socket_infer2"])
     name = "socket_ph32_exec16"
     last = write_evaluation(folder.parents[1], 1, number=100)
+    another = write_evaluation(make_run(tmp_path / name / "seed=1", name, seed=1), 1, number=100)
     standard = write_evaluation(make_run(tmp_path / name / "core=standard", name), 2, number=100)
     sources = Sources([tmp_path])
     others = sources.others([sources.answer(row, MAPPING) for row in MAPPING.rows])
-    assert [found.evaluation.folder for found in others] == [last, standard]
+    assert [[found.evaluation.folder for found in seeds] for seeds in others] == [[last, another], [standard]]
