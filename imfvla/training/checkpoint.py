@@ -5,6 +5,8 @@ Loading is strict: a missing, foreign or misshapen tensor is an error that names
 
 import errno
 import json
+import os
+import re
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -147,8 +149,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     try:
         save_file(on_cpu, path, metadata=dict(header))
     except SafetensorError as error:  # it wraps the system's error, whose number is in the text alone
-        number = next((int(part.rstrip(")")) for part in str(error).split("os error ")[1:]), None)
-        raise OSError(number, str(error)) from error
+        number = re.search(r"os error (\d+)", str(error))
+        if number is None:
+            raise OSError(None, str(error)) from error
+        raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -125,7 +125,9 @@ class TestFullDisk:
 
     def test_system_error_inside_safetensors_is_told(self, tmp_path, monkeypatch):
         def fails(*_, **__):
-            raise checkpoint.SafetensorError("Error: I/O error: No space left on device (os error 28)")
+            raise checkpoint.SafetensorError(
+                'Error: I/O error: No space left on device (os error 28) at path "/a"'
+            )
 
         monkeypatch.setattr(checkpoint, "save_file", fails)
         with pytest.raises(OSError, match="No space left") as caught:
