@@ -1,5 +1,10 @@
 """python -m imfvla.gallery task=socket: a contact sheet of every view, for both ways of the hidden choice."""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from imfvla.entry import entry_point
+from imfvla.files import write_together
 from imfvla.options import require
 
 MARGIN = 6  # px between pictures
@@ -44,7 +50,8 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
         frames = _play(env, expert, seed, size)
         chosen = [frames[round(share * (len(frames) - 1))] for share in (0, 0.25, 0.5, 1)]
         path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
-        cv2.imwrite(str(path), _sheet(chosen)[:, :, ::-1])
+        _, picture = cv2.imencode(".png", _sheet(chosen)[:, :, ::-1])
+        write_together({path: picture.tobytes()})
         paths.append(path)
     env.close()
     return paths

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.files import write_json, write_text
+from imfvla.files import clear_write_errors, copy_file, write_json, write_text
 from imfvla.reporting.runs import evaluations
 from imfvla.run_directory import DONE, LAST, RunDirectory
 
@@ -15,7 +15,7 @@ RECORDED = ("depth_attention.json",)  # what tools may have added to a run
 
 
 def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
-    """Fills `target`, which must not be there yet, and returns what made_by.json says.
+    """Makes `target`, which must not be there yet, whole or not at all, and returns what made_by.json says.
 
     Taken are config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
     summaries of the reporting band, and what `RECORDED` names. Raises UserError for an unfinished run, weights above
@@ -34,20 +34,22 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     if not reported:
         raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
     made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
-    target.mkdir(parents=True)
-    if with_weights:
-        shutil.copytree(weights.parent, target / weights.parent.relative_to(run.path))
-    recorded = [name for name in RECORDED if (run.path / name).exists()]
-    for name in ("config.yaml", "status.json", *recorded):
-        shutil.copy2(run.path / name, target / name)
+    recorded = [run.path / name for name in RECORDED if (run.path / name).exists()]
+    copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
+    copied += sorted(weights.parent.iterdir()) if with_weights else []
+    copied += [one.folder / name for one in reported for name in ("episodes.jsonl", "summary.json")]
     rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
-    write_text(target / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
-    for evaluation in reported:
-        folder = target / evaluation.folder.relative_to(run.path)
-        folder.mkdir(parents=True)
-        for name in ("episodes.jsonl", "summary.json"):
-            shutil.copy2(evaluation.folder / name, folder / name)
-    write_json(target / "made_by.json", made_by)
+    part = target.with_name(f".{target.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        for source in copied:
+            copy_file(source, part / source.relative_to(run.path))
+        write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
+        write_json(part / "made_by.json", made_by)
+        with clear_write_errors(target):
+            part.rename(target)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     return made_by
 
 
