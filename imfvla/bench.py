@@ -1,5 +1,10 @@
 """python -m imfvla.bench: speed of simulation, rendering, demonstrations, training and inference on this machine."""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
 import json
 import logging
 import tempfile

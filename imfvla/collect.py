@@ -1,5 +1,10 @@
 """python -m imfvla.collect task=socket episodes=200"""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
 from typing import Any
 
 from imfvla.entry import entry_point

@@ -1,5 +1,11 @@
 """python -m imfvla.compare RUN_A RUN_B [nfe=2]: two runs, start by start: a verdict, a table and a picture."""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +48,7 @@ def _compare(config: dict[str, Any]) -> None:
 def main(argv: Sequence[str] | None = None) -> None:
     """The command. Takes directories as they are: `RUN_A RUN_B` for `runs=[RUN_A,RUN_B]`."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    named = [text for text in arguments if Path(text).exists() or not ("=" in text or text.startswith("-"))]
+    named = [text for text in arguments if os.path.exists(text) or not ("=" in text or text.startswith("-"))]
     others = nfe_as_list([text for text in arguments if text not in named])
     _compare([*others, f"runs=[{','.join(map(quoted, named))}]"] if named else others)
 

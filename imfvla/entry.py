@@ -1,8 +1,7 @@
-"""What `python -m imfvla.<name>` has around it: Hydra, one clear line for a user's mistake, exit codes."""
+"""What `python -m imfvla.<name>` has around it beside `imfvla.command`: Hydra, sweeps, the failures of their jobs."""
 
 import argparse
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,12 +16,10 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
-from imfvla.errors import UserError
+from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
+from imfvla.errors import REMEDIES, WHERE_MISSING, told
 from imfvla.jobs import Failure, Job
-from imfvla.signals import Stopped, stoppable
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
-
-EXIT_FAILURE, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
 
 
 def entry_point(
@@ -57,33 +54,26 @@ def output_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+@as_command
 def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
     composition.register_resolvers()
     if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
         arguments = [*arguments, "hydra/job_logging=disabled"]
     known = get_args_parser().parse_args(arguments)
     try:
-        with _hydra_raises(arguments), stoppable():
+        with _hydra_raises(arguments):
             composition.refuse_added_keys(job.config_name, known.overrides)
             if _is_sweep(known):
                 failures = run_sweep(job, known.overrides, is_finished)
             else:
                 _run_once(job)
                 failures = [job.failure] if job.failure else []
-    except (HydraException, OmegaConfBaseException, UserError) as error:
-        failures = [Failure.of(error, job.config_name, " ".join(known.overrides))]
-    except Stopped as stop:
-        name = signal.Signals(stop.number).name
-        text = (
-            "Interrupted."
-            if stop.number == signal.SIGINT
-            else f"Stopped by {name}; the same command goes on."
-        )
-        print(text, file=sys.stderr)
-        return stop.exit_code
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    except (HydraException, OmegaConfBaseException) as error:
+        raise composition.explain(error, job.config_name, known.overrides) from error
+    except (OSError, ValueError) as error:  # ours, and of what Hydra itself writes: directories, train.log
+        if (known_error := told(error, REMEDIES | WHERE_MISSING)) is None:
+            raise
+        raise known_error from error
     return _report(failures)
 
 

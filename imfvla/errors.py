@@ -1,8 +1,53 @@
-"""The one error type that users see: it names the thing, what was wanted, what was found and the remedy."""
+"""The one error type that users see, and the system's errors in its words."""
+
+import errno
+import os
 
 
 class UserError(ValueError):
-    """A mistake that the user can mend. Entry points print its text alone and exit with status 2.
+    """A mistake that the user can correct. Commands print its text alone and exit with status 2.
 
     The text is one sentence or two: the key or file, what was wanted, what was found, the remedy.
     """
+
+
+_SPACE = "free some space there"
+_PERMISSION = "check who may read and write there, or choose another directory"
+_IN_THE_WAY = "remove what has that name, or choose another directory"
+_DEVICE = "check that disk or network"
+# What the user can do about an error of the system. A missing file is none: only its reader knows what that means.
+REMEDIES = {
+    errno.ENOSPC: _SPACE,
+    errno.EDQUOT: _SPACE,
+    errno.EROFS: "choose a directory that may be written to",
+    errno.EACCES: _PERMISSION,
+    errno.EPERM: _PERMISSION,
+    errno.EEXIST: _IN_THE_WAY,
+    errno.ENOTDIR: _IN_THE_WAY,
+    errno.EISDIR: _IN_THE_WAY,
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.EIO: _DEVICE,
+    errno.ESTALE: _DEVICE,
+    errno.EMFILE: "no file handle is left, raise the limit with ulimit -n 4096",
+    errno.ENFILE: "no file handle is left, stop other programs",
+}
+WHERE_MISSING = {errno.ENOENT: "check that the directories above it are there"}
+
+
+def told(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
+    """A UserError itself, or one for a system error or what was raised because of it; None for other errors."""
+    if isinstance(error, UserError):
+        return error
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and isinstance(cause.__context__, UserError) and not cause.filename:
+            return cause.__context__  # that closing the file has met with again, and names no file for
+        if isinstance(cause, OSError) and cause.errno in remedies:
+            file = f" at {os.fsdecode(cause.filename)}" if isinstance(cause.filename, str | bytes) else ""
+            return UserError(f"{cause.strerror}{file}: {remedies[cause.errno]}; run the same command again.")
+        if isinstance(cause, MemoryError):
+            return UserError(
+                f"Out of memory: {cause or 'no details'}; choose fewer workers=... or a smaller batch."
+            )
+        cause = cause.__cause__
+    return None

@@ -1,9 +1,14 @@
 """python -m imfvla.evaluate run=DIR episodes=100 first_seed=100000 nfe=1,2,3"""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
+import os
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from imfvla.entry import entry_point
@@ -51,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _with_directory_quoted(argument: str) -> str:
     """`run=DIR` for Hydra, where DIR is there: names of runs have `=` and `,` in them."""
     directory = argument.removeprefix("run=")
-    is_directory = directory != argument and Path(directory).is_dir()
+    is_directory = directory != argument and os.path.isdir(directory)
     return f"run={quoted(directory)}" if is_directory else argument
 
 

@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import json
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +13,7 @@ from typing import Any
 
 from imfvla.errors import UserError
 
+log = logging.getLogger(__name__)
 PARTIAL = ".tmp"  # suffix of what is being written; a leftover belongs to a killed process and may be deleted
 
 
@@ -84,9 +86,25 @@ def locked(path: Path) -> Iterator[None]:
     with ExitStack() as held:
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            stream = held.enter_context(open(path.with_name(f".{path.name}.lock"), "w"))
-            fcntl.flock(stream, fcntl.LOCK_EX)
+            stream = held.enter_context(open(path.with_name(f".{path.name}.lock"), "w", encoding="utf-8"))
+            take_lock(stream.fileno(), path, wait=True)
         yield
+
+
+def take_lock(descriptor: int, path: Path, *, wait: bool = False) -> bool:
+    """Whether this process has the lock of an open file from now on: not where another one has it, unless it waits.
+
+    Some file systems, of networks above all, have no locks. Then `path` is named in a warning and work starts without.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        log.warning(
+            "%s cannot be locked (%s): let no other command write there meanwhile.", path, error.strerror
+        )
+    return True
 
 
 def sync(path: Path) -> None:

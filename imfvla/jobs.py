@@ -1,7 +1,5 @@
 """One job of a command, as Hydra's launchers run it, here or on another machine: a failure comes back as a value."""
 
-import errno
-import os
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,25 +11,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
-from imfvla.errors import UserError
-
-# What of the system's own errors the user can mend.
-SYSTEM_REMEDIES = {
-    errno.ENOSPC: "free some space",
-    errno.EDQUOT: "free some space",
-    errno.EROFS: "choose a directory that may be written to",
-    errno.EMFILE: "no file handle is left, raise the limit with ulimit -n 4096",
-    errno.ENFILE: "no file handle is left, stop other programs",
-}
-
-
-def told(error: Exception) -> Exception:
-    """A UserError in place of one of the system's that the user can mend; any other error as it is."""
-    if not isinstance(error, OSError) or error.errno not in SYSTEM_REMEDIES:
-        return error
-    file = f" at {os.fsdecode(error.filename)}" if error.filename else ""
-    remedy = f"{SYSTEM_REMEDIES[error.errno]}; run the same command again."
-    return UserError(f"{error.strerror}{file}: {remedy}")
+from imfvla.errors import told
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +26,9 @@ class Failure:
     def of(cls, error: Exception, config_name: str, overrides: str) -> "Failure":
         if isinstance(error, HydraException | OmegaConfBaseException):
             error = composition.explain(error, config_name, overrides.split())
-        error = told(error)
-        if isinstance(error, UserError):
-            return cls(overrides, str(error), True)
+        known = told(error)
+        if known is not None:
+            return cls(overrides, str(known), True)
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)
 
 

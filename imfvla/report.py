@@ -1,5 +1,10 @@
 """python -m imfvla.report [run=DIR]"""
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
 from pathlib import Path
 from typing import Any
 

@@ -1,6 +1,5 @@
 """The files of one evaluation: rows as they come, so that a killed one goes on, and the whole at the end."""
 
-import fcntl
 import json
 import logging
 import os
@@ -12,7 +11,7 @@ from typing import Any
 
 from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors, write_json, write_text
+from imfvla.files import clear_write_errors, take_lock, write_json, write_text
 from imfvla.fingerprint import code_version
 from imfvla.protocol import as_recorded
 from imfvla.reporting.episodes import read_row
@@ -41,11 +40,9 @@ class RolloutLog:
         with clear_write_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self.path, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not take_lock(self._lock, self.path):
             os.close(self._lock)
-            raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.") from None
+            raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.")
         self._stream = None
         self.rows: list[dict[str, Any]] = []
         self.summary = None if self._overwrite else self._finished()

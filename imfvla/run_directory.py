@@ -6,7 +6,6 @@ checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
 rollouts/<evaluation>/
 """
 
-import fcntl
 import hashlib
 import json
 import os
@@ -22,7 +21,7 @@ import yaml
 
 from imfvla.documents import read_json, read_yaml
 from imfvla.errors import UserError
-from imfvla.files import write_json, write_text
+from imfvla.files import clear_write_errors, take_lock, write_json, write_text
 
 RUNNING, DONE, FAILED = "running", "done", "failed"
 LAST = (
@@ -158,19 +157,19 @@ class RunDirectory:
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Held while a process trains here. Raises UserError where another one does."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        with open(self.path / ".lock", "a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+        path = self.path / ".lock"
+        with clear_write_errors(path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  closed below
+        with file:
+            if not take_lock(file.fileno(), self.path):
                 file.seek(0)
                 owner = file.read().strip() or "unknown"
-                raise UserError(
-                    f"{self.path} is in use by process {owner}: wait for it or stop it."
-                ) from None
-            file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
+                raise UserError(f"{self.path} is in use by process {owner}: wait for it or stop it.")
+            with clear_write_errors(path):
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
             yield
 
 

@@ -4,12 +4,15 @@ Everything that a command writes is whole or absent at any moment, so a stop may
 off to the end of the step, to keep the steps since the last save.
 """
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+Handler = Callable[[int, FrameType | None], None]
 
 
 class Stopped(KeyboardInterrupt):
@@ -24,6 +27,13 @@ class Stopped(KeyboardInterrupt):
         """As shells say it: 130 after Ctrl-C, 143 after SIGTERM, 138 after SIGUSR1."""
         return 128 + self.number
 
+    @property
+    def sentence(self) -> str:
+        """What a command says at its end."""
+        if self.number == signal.SIGINT:
+            return "Interrupted."
+        return f"Stopped by {signal.Signals(self.number).name}; the same command goes on."
+
 
 class StopRequest:
     """`number` is the signal that came, None for none so far."""
@@ -31,15 +41,29 @@ class StopRequest:
     number: int | None = None
 
 
-@contextmanager
-def stoppable() -> Iterator[None]:
-    """Inside, each of `SIGNALS` raises `Stopped` where the process happens to be."""
+def stop_at_once() -> None:
+    """From here on each of `SIGNALS` ends this process with its sentence and exit code."""
+    for number in SIGNALS:
+        signal.signal(number, _end)
 
-    def stop(number: int, frame: object) -> None:
+
+@contextmanager
+def stoppable() -> Iterator[StopRequest]:
+    """Inside, each of `SIGNALS` raises `Stopped` where the process happens to be.
+
+    It is noted in what is yielded too, since libraries may turn what is raised within them into errors of their own.
+    While modules are imported it ends the process instead: the import system drops exceptions of its callbacks.
+    """
+    request = StopRequest()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if _is_importing(frame):
+            _end(number, frame)
+        request.number = number
         raise Stopped(number)
 
     with _handling(stop):
-        yield
+        yield request
 
 
 @contextmanager
@@ -47,7 +71,7 @@ def deferred_stop() -> Iterator[StopRequest]:
     """Inside, the first of `SIGNALS` is noted in what is yielded; a second one raises `Stopped` at once."""
     request = StopRequest()
 
-    def note(number: int, frame: object) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         if request.number is not None:
             raise Stopped(number)
         request.number = number
@@ -57,7 +81,39 @@ def deferred_stop() -> Iterator[StopRequest]:
 
 
 @contextmanager
-def _handling(handler: Callable[[int, object], None]) -> Iterator[None]:
+def held_back() -> Iterator[None]:
+    """Inside, `SIGNALS` wait for the end of the block; a process that is started here begins with them blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore_stops() -> None:
+    """For a process that another one ends: a terminal sends the signals to both."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    stop = Stopped(number)
+    with suppress(OSError):
+        os.write(2, f"{stop.sentence}\n".encode())
+    os._exit(stop.exit_code)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+@contextmanager
+def _handling(handler: Handler) -> Iterator[None]:
     """Handlers belong to the main thread: in another one nothing is changed."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -3,6 +3,11 @@
 With -m, or +sweep=NAME for a file of conf/sweep: many of them, without those that are finished.
 """
 
+from imfvla.command import begin
+
+if __name__ == "__main__":
+    begin()
+
 from typing import Any
 
 from imfvla.completion import is_complete

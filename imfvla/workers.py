@@ -3,20 +3,24 @@
 A process that dies, or takes longer than it may (a graphics driver that hangs), is replaced, and its call made again.
 """
 
+import copy
 import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import connection
+from dataclasses import dataclass
+from multiprocessing import connection, resource_tracker
+from types import ModuleType
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.signals import SIGNALS
+from imfvla.signals import held_back, ignore_stops
 
 MAX_ATTEMPTS = 3  # of one call: what kills three workers kills the next one too
 log = logging.getLogger(__name__)
@@ -76,7 +80,10 @@ class Pool:
             if found:
                 return found
             late = time.monotonic() - (self._timeout_s or 0.0)
-            hanging = _Lost(f"gave no answer within {self._timeout_s:g} s")
+            hanging = _Lost(
+                f"gave no answer within {self._timeout_s:g} s",
+                "if a graphics driver hangs, try export MUJOCO_GL=osmesa",
+            )
             if found := [(worker, hanging) for worker, (_, _, began) in busy.items() if began <= late]:
                 return found
 
@@ -85,11 +92,10 @@ class Pool:
         self._workers[self._workers.index(worker)] = _Worker(after=worker)
         if attempts == MAX_ATTEMPTS:
             raise UserError(
-                f"A worker process {loss}, {attempts} times over the same episode: if it died, perhaps for want of "
-                "memory: choose fewer workers=...; if it hangs, try export MUJOCO_GL=osmesa. Then run the same "
-                "command again; finished episodes are kept."
+                f"A worker process {loss.what}, {attempts} times over the same episode: {loss.remedy}. Then run the "
+                "same command again; finished episodes are kept."
             )
-        log.warning("A worker process %s: its episode is made again in a fresh one.", loss)
+        log.warning("A worker process %s: its episode is made again in a fresh one.", loss.what)
 
     def close(self) -> None:
         for worker in self._workers:
@@ -121,8 +127,23 @@ def worker_pool(count: int, timeout_s: float | None = None) -> Iterator[Here | P
             os.environ["OMP_NUM_THREADS"] = before
 
 
-class _Lost(str):
-    """What became of a worker that answers no more."""
+@dataclass(frozen=True, slots=True)
+class _Lost:
+    """What became of a worker that answers no more, and what the user can do about it."""
+
+    what: str
+    remedy: str
+
+    @classmethod
+    def by_exit(cls, code: int) -> "_Lost":
+        """`code` is the exit code, or minus the signal."""
+        if code == -signal.SIGKILL:
+            remedy = "Linux does so where memory ends, so choose fewer workers=..."
+            return cls("was killed (SIGKILL)", remedy)
+        if code < 0:
+            remedy = "if a graphics driver crashed, try export MUJOCO_GL=osmesa"
+            return cls(f"crashed ({signal.Signals(-code).name})", remedy)
+        return cls(f"ended (exit code {code})", "its own last words are printed above")
 
 
 class _Worker:
@@ -134,7 +155,9 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
+        resource_tracker.ensure_running()  # it would let the signals through
+        with held_back(), _without_main():
+            self._process.start()
         theirs.close()  # so that its death closes the connection
 
     def send(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
@@ -146,7 +169,7 @@ class _Worker:
             return self.connection.recv()
         except (EOFError, ConnectionResetError):
             self._process.join()
-            return _Lost(f"died (exit code {self._process.exitcode})")
+            return _Lost.by_exit(self._process.exitcode)
 
     def end(self) -> None:
         self._process.kill()
@@ -154,25 +177,54 @@ class _Worker:
         self.connection.close()
 
 
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """A process that starts inside does not run the user's script, which may lack `if __name__ == "__main__"`."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
 def _serve(calls: connection.Connection) -> None:
     """Answers (function, arguments) with (whether it succeeded, result or exception)."""
-    for number in SIGNALS:  # meant for the process that shares the work out; a terminal sends them to all
-        signal.signal(number, signal.SIG_IGN)
+    ignore_stops()
     threading.Thread(target=_die_with_parent, daemon=True).start()
     while True:
         try:
             function, arguments = calls.recv()
         except EOFError:
             return
-        try:
-            answer = (True, function(*arguments))
         except Exception as error:
-            error.add_note(f"In a worker process:\n{traceback.format_exc()}")
-            answer = (False, error)
+            answer = (False, _sendable(error))
+        else:
+            answer = _answer(function, arguments)
         try:
             calls.send(answer)
-        except (TypeError, AttributeError, ValueError) as error:  # what cannot be sent
+        except Exception as error:
             calls.send((False, RuntimeError(f"{answer[1]!r} cannot be sent back: {error}")))
+
+
+def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[bool, Any]:
+    try:
+        return True, function(*arguments)
+    except (Exception, SystemExit) as error:
+        return False, _sendable(error)
+
+
+def _sendable(error: BaseException) -> Exception:
+    """The error with the worker's traceback; where it cannot be sent, or ends a process, one that says the same."""
+    trace = traceback.format_exc()
+    try:
+        sent = copy.copy(error)  # made as the other process makes it
+    except Exception:
+        sent = None
+    if not isinstance(sent, Exception):
+        sent = RuntimeError(f"{type(error).__name__}: {error}")
+    sent.add_note(f"In a worker process:\n{trace}")
+    return sent
 
 
 def _die_with_parent() -> None:

@@ -127,7 +127,7 @@ def test_a_name_that_fits_nothing_is_told_with_those_there_are():
 def test_the_list_runs_nothing(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(sys, "argv", ["campaign.py", "--list", "--only", "socket_act"])
     none_is_done = partial(TOOL.policies, results=tmp_path)
-    monkeypatch.setitem(TOOL.main.__globals__, "policies", none_is_done)
+    monkeypatch.setitem(TOOL.main.__wrapped__.__globals__, "policies", none_is_done)
     assert TOOL.main() == 0
     assert capsys.readouterr().out.startswith("open  python -m imfvla.train +exp=socket_act evaluation.")
 

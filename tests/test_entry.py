@@ -66,6 +66,23 @@ def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
     assert words in (None, printed)
 
 
+@pytest.mark.parametrize("mode", [[], ["-m"]])
+@pytest.mark.parametrize("in_the_way", ["runs", "runs/x/seed=5/train.log"])
+def test_what_hydra_cannot_write_is_told_in_one_line(tmp_path, capfd, mode, in_the_way):
+    (tmp_path / in_the_way).parent.mkdir(parents=True, exist_ok=True)
+    if in_the_way == "runs":
+        (tmp_path / in_the_way).write_text("no directory")
+    else:
+        (tmp_path / in_the_way).mkdir()
+    with pytest.raises(SystemExit) as exit_:
+        command([*mode, "name=x", "seed=5"])
+    assert exit_.value.code == 2
+    last = capfd.readouterr().err.splitlines()[-1]
+    assert f"{in_the_way}: remove what has that name, or choose another directory" in last.replace(
+        "/x/seed=5:", ":"
+    )
+
+
 def test_our_own_mistakes_show_a_traceback(capfd):
     with pytest.raises(SystemExit) as exit_:
         command(["seed=2"])

@@ -1,4 +1,6 @@
 import errno
+import fcntl
+import os
 import threading
 from pathlib import Path
 
@@ -6,6 +8,8 @@ import pytest
 
 from imfvla.errors import UserError
 from imfvla.files import copy_file, locked, write_atomically, write_json, write_text, write_together
+from imfvla.rollout_log import RolloutLog
+from imfvla.run_directory import RunDirectory
 
 
 def test_replaces_whole(tmp_path):
@@ -84,3 +88,20 @@ def test_a_copy_is_made_where_it_differs(tmp_path):
     source.write_text("another")
     copy_file(source, copy)
     assert copy.read_text() == "another"
+
+
+def test_only_a_lock_that_another_process_holds_is_one_that_is_held(tmp_path, monkeypatch, caplog):
+    run = RunDirectory(tmp_path / "run")
+    with run.lock(), pytest.raises(UserError, match=rf"is in use by process {os.getpid()}"):
+        run.lock().__enter__()
+
+    def not_here(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", not_here)
+    with run.lock(), RolloutLog(tmp_path / "rollouts", {}), locked(tmp_path / "store"):
+        pass
+    for path in (run.path, tmp_path / "rollouts", tmp_path / "store"):
+        assert (
+            f"{path} cannot be locked (No locks available): let no other command write there" in caplog.text
+        )

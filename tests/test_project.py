@@ -119,3 +119,47 @@ def imported(path: Path) -> set[str]:
             modules |= {f"{node.module}.{name.name}" for name in node.names}
     parts = {module.split(".")[1] for module in modules if module.startswith("imfvla.")}
     return parts | ({module.split(".")[0] for module in modules} & {"torch", "mujoco", "dm_control"})
+
+
+SOURCES = sorted([*(ROOT / "imfvla").rglob("*.py"), *(ROOT / "tools").rglob("*.py")])
+COMMANDS = [path for path in SOURCES if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")]
+
+
+def test_text_is_read_and_written_as_utf_8_whatever_the_locale():
+    offenders = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and takes_the_locales_encoding(node)
+    ]
+    assert not offenders
+
+
+def takes_the_locales_encoding(call: ast.Call) -> bool:
+    """Whether a call of `open`, `Path.read_text`, `subprocess.run` or the like leaves the encoding to the locale."""
+    method = call.func.attr if isinstance(call.func, ast.Attribute) else None
+    words = {word.arg: ast.unparse(word.value) for word in call.keywords}
+    if "encoding" in words:
+        return False
+    if method in ("read_text", "write_text"):
+        return True
+    if words.get("text") == "True" or words.get("universal_newlines") == "True":
+        return True
+    is_builtin = isinstance(call.func, ast.Name) and call.func.id == "open"
+    arguments = call.args[1:] if is_builtin else call.args
+    mode = words.get("mode") or (ast.unparse(arguments[0]) if arguments else "'r'")
+    return (is_builtin or (method == "open" and not arguments)) and "b" not in mode
+
+
+def test_every_command_begins_before_its_other_imports():
+    """Then Ctrl-C prints no traceback while they are loaded, and standard output takes any character."""
+    assert not [path.relative_to(ROOT) for path in COMMANDS if not begins_first(path)]
+
+
+def begins_first(command: Path) -> bool:
+    body = ast.parse(command.read_text(encoding="utf-8")).body
+    guard = next((number for number, node in enumerate(body) if isinstance(node, ast.If)), len(body))
+    before = {node.module for node in body[:guard] if isinstance(node, ast.ImportFrom)}
+    before |= {name.name for node in body[:guard] if isinstance(node, ast.Import) for name in node.names}
+    begins = guard < len(body) and ast.unparse(body[guard]).endswith("\n    begin()")
+    return begins and before <= {"imfvla.command", "sys", "pathlib"}

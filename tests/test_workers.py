@@ -43,10 +43,62 @@ def test_in_this_process_work_is_done_one_by_one():
         assert done == [1]
 
 
-def test_the_death_of_a_worker_is_told_with_the_remedy():
-    with pytest.raises(UserError, match=r"died, perhaps for want of memory: choose fewer workers"):  # noqa: SIM117
-        with worker_pool(1) as run_all:
-            list(run_all(os._exit, [(1,)]))
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ((os._exit, (1,)), r"ended \(exit code 1\), 3 times .*: its own last words are printed above"),
+        ((signal.raise_signal, (9,)), r"was killed \(SIGKILL\), 3 times .* choose fewer workers"),
+        ((signal.raise_signal, (11,)), r"crashed \(SIGSEGV\), 3 times .* export MUJOCO_GL=osmesa"),
+    ],
+)
+def test_the_death_of_a_worker_is_told_with_its_reason_and_the_remedy(call, words):
+    function, arguments = call
+    with pytest.raises(UserError, match=words), worker_pool(1) as run_all:
+        list(run_all(function, [arguments]))
+
+
+class OddError(Exception):
+    """Cannot be made again from its arguments, as pickle does."""
+
+    def __init__(self, one: int, two: int) -> None:
+        super().__init__(f"{one} and {two}")
+
+
+def raise_odd_error() -> None:
+    raise OddError(1, 2)
+
+
+class OnlyHere:
+    """Of a module that no other process can import."""
+
+
+OnlyHere.__module__ = "nowhere"
+
+
+def test_whatever_a_worker_raises_arrives(monkeypatch):
+    nowhere = monkeypatch.setitem(sys.modules, "nowhere", sys.modules[__name__])
+    assert nowhere is None
+    with worker_pool(1) as run_all:
+        with pytest.raises(RuntimeError, match="OddError: 1 and 2"):
+            list(run_all(raise_odd_error, [()]))
+        with pytest.raises(RuntimeError, match="SystemExit: enough"):
+            list(run_all(sys.exit, [("enough",)]))
+        with pytest.raises(ModuleNotFoundError, match="No module named 'nowhere'"):
+            list(run_all(print, [(OnlyHere(),)]))
+        assert run_all.incidents == 0
+
+
+def test_a_script_needs_no_guard(tmp_path):
+    lines = (
+        "from imfvla.workers import worker_pool",
+        "with worker_pool(1) as do:",
+        "    print(*do(abs, [(-3,)]))",
+    )
+    (tmp_path / "script.py").write_text("\n".join(lines))
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "3\n", "")
 
 
 def fault_once(marker: str, fault: str, number: int) -> int:

@@ -11,6 +11,11 @@ campaign goes on where it was stopped, on another machine too, though what was h
 that fails ends no other one. Ctrl-C lets those that train save their state. Weights stay in runs/.
 """
 
+from imfvla.command import EXIT_FAILURE, as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import logging
 import shutil
@@ -29,12 +34,11 @@ from imfvla.errors import UserError
 from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
 from imfvla.shipping import ship
-from imfvla.signals import Stopped, stoppable
+from imfvla.signals import Stopped
 from imfvla.sweep import Planned, planned_jobs
 
 RESULTS, LOGS = Path("experiments/results"), Path("runs/campaign")
 ALONG_OTHERS = ("training.threads=1", "evaluation.workers=1")
-EXIT_FAILURE, EXIT_USER_ERROR = 1, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +174,7 @@ def commit(policy: Policy, made_by: dict[str, object]) -> None:
     subprocess.run(["git", "commit", "--quiet", "--message", message, "--", target], check=True)
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--sweep", default="campaign", help="file of conf/sweep")
@@ -179,25 +184,13 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    try:
-        chosen = policies(arguments.sweep, arguments.only)
-        if arguments.list:
-            for policy in chosen:
-                print(
-                    "\n".join(f"{'done' if policy.is_done else 'open'}  {line}" for line in policy.commands)
-                )
-            return 0
-        waiting = [policy for policy in chosen if not policy.is_done]
-        with stoppable():
-            failures = Campaign(arguments.side_by_side, arguments.commit).run(
-                waiting, len(chosen) - len(waiting)
-            )
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return EXIT_USER_ERROR
-    except Stopped as stop:
-        print("Stopped; the same command goes on.", file=sys.stderr)
-        return stop.exit_code
+    chosen = policies(arguments.sweep, arguments.only)
+    if arguments.list:
+        for policy in chosen:
+            print("\n".join(f"{'done' if policy.is_done else 'open'}  {line}" for line in policy.commands))
+        return 0
+    waiting = [policy for policy in chosen if not policy.is_done]
+    failures = Campaign(arguments.side_by_side, arguments.commit).run(waiting, len(chosen) - len(waiting))
     print("\n".join(failures), file=sys.stderr, end="\n" * bool(failures))
     return EXIT_FAILURE if failures else 0
 

@@ -18,6 +18,11 @@ checkpoints, recordings and logs are the real ones. Prints a line for each fault
 differs.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import random
 import sys
@@ -51,6 +56,7 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
 }
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", nargs="*", help=f"of {', '.join(FAULTS)}; all by default")

@@ -5,12 +5,16 @@ python tools/depth_attention.py experiments/pretrained/socket_ph32_exec16
 Writes depth_attention.json into the run directory: the mean weights of each sublayer over all tokens and decisions.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import sys
 from pathlib import Path
 
 from imfvla.depth_attention import measure_depth_attention
-from imfvla.errors import UserError
 from imfvla.files import write_json
 from imfvla.run_directory import RunDirectory
 from imfvla.workbench import load_workbench
@@ -19,6 +23,7 @@ SELECTION_FIRST_SEED = 10_000
 FILE = "depth_attention.json"
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run")
@@ -27,19 +32,15 @@ def main() -> int:
     parser.add_argument("--nfe", type=int, default=1, help="evaluations of the network")
     parser.add_argument("--max-steps", type=int, default=None, help="control steps, all of them by default")
     arguments = parser.parse_args()
-    try:
-        directory = RunDirectory(arguments.run)
-        checkpoint = int(arguments.checkpoint) if arguments.checkpoint.isdecimal() else arguments.checkpoint
-        step = directory.weights_step(checkpoint)
-        env, policy = load_workbench(arguments.run, step)
-        found = measure_depth_attention(
-            env, policy, seed=arguments.seed, nfe=arguments.nfe, max_steps=arguments.max_steps
-        )
-        found = {"experiment": directory.config()["name"], "checkpoint_step": step, **found}
-        write_json(arguments.run / FILE, found)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    directory = RunDirectory(arguments.run)
+    checkpoint = int(arguments.checkpoint) if arguments.checkpoint.isdecimal() else arguments.checkpoint
+    step = directory.weights_step(checkpoint)
+    env, policy = load_workbench(arguments.run, step)
+    found = measure_depth_attention(
+        env, policy, seed=arguments.seed, nfe=arguments.nfe, max_steps=arguments.max_steps
+    )
+    found = {"experiment": directory.config()["name"], "checkpoint_step": step, **found}
+    write_json(arguments.run / FILE, found)
     print(arguments.run / FILE)
     return 0
 

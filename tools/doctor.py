@@ -8,18 +8,27 @@ The frame is rendered in a process of its own with a time limit, so that a graph
 hang the doctor.
 """
 
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # works before the package is installed
+
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
+
 import argparse
 import json
 import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 MIN_PYTHON = (3, 11)
@@ -95,7 +104,7 @@ def check_threads() -> Finding:
 def check_packages(constraints: Path = ROOT / "constraints.txt") -> Finding:
     """The installed packages are those of constraints.txt; a local version (torch's +cpu) does not matter."""
     missing, other, num_pins = [], [], 0
-    for line in constraints.read_text().splitlines():
+    for line in constraints.read_text(encoding="utf-8").splitlines():
         if not line or line.startswith("#"):
             continue
         name, _, wanted = line.partition("==")
@@ -246,8 +255,14 @@ def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dic
     """The answer of `render_frame` in a process of its own, or None and what went wrong."""
     command = [sys.executable, str(Path(__file__).resolve()), "--render-frame"]
     try:
-        environment = os.environ | environment
-        child = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout_s)
+        child = subprocess.run(
+            command,
+            env=os.environ | environment,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=timeout_s,
+        )
     except subprocess.TimeoutExpired:
         return None, f"no frame within {timeout_s:.0f} s: the graphics driver hangs"
     if child.returncode == 0:
@@ -264,6 +279,7 @@ def run_check(name: str) -> Finding:
         return Finding(name, f"{type(error).__name__}: {error}", REINSTALL)
 
 
+@as_command
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -285,5 +301,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))  # works before the package is installed, and says then what is missing
     sys.exit(main())

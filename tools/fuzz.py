@@ -10,6 +10,11 @@ checksums that fit. Prints a line for each reader and exits with 1 where anythin
 longer than it may, or memory grew beyond its bound.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import json
 import random
@@ -35,6 +40,7 @@ from mcap.writer import CompressionType, Writer
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
+from imfvla.files import write_json
 from imfvla.nn.pretrained import read_weights
 from imfvla.recording import read_episode, read_index
 from imfvla.reporting.curves import learning_curve
@@ -259,12 +265,11 @@ def make_targets(folder: Path) -> dict[str, Target]:
     seeds = range(100_000, 100_003)
     partial = RolloutLog(folder / "partial", {"nfe": 1})
     with partial:
-        for line in (rollouts / "episodes.jsonl").read_text().splitlines():
+        for line in (rollouts / "episodes.jsonl").read_text(encoding="utf-8").splitlines():
             partial.append(json.loads(line))
     depth = folder / "depth_attention.json"
-    depth.write_text(
-        json.dumps({"experiment": "x", "checkpoint_step": 3, "actions": [[1.0], [0.5, 0.5]], "context": []})
-    )
+    weights = {"actions": [[1.0], [0.5, 0.5]], "context": []}
+    write_json(depth, {"experiment": "x", "checkpoint_step": 3, **weights})
     store = folder / "store"
     FrameStore.build(
         write_demonstrations(folder / "demos", num_episodes=2, num_steps=4), store, (16, 16), ("front",)
@@ -336,6 +341,7 @@ def _raise_too_slow(*_: object) -> None:
     raise TooSlow(f"more than {MAX_SECONDS} s")
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--files", type=int, default=20_000, help="over all readers")
@@ -366,7 +372,7 @@ def main() -> int:
     print(f"{total} files, {failed} failures, memory grew by at most {grown / 2**20:.0f} MiB")
     if options.summary:
         figures = {"files": total, "failures": failed, "grown_mib": round(grown / 2**20), "readers": rows}
-        options.summary.write_text(json.dumps(figures, indent=2) + "\n")
+        options.summary.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return 1 if failed or grown > MAX_GROWTH_BYTES else 0
 
 

@@ -5,6 +5,11 @@ python tools/handover.py runs/transfer_ph32_exec16/default
 The expert lets 4 control steps pass. Prints successes and failures by that number; "-" where a hand did neither.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import sys
 from collections import Counter
@@ -14,7 +19,6 @@ import numpy as np
 
 from imfvla.actor import ChunkActor
 from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult, Step
-from imfvla.errors import UserError
 from imfvla.progress import Progress
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
@@ -51,6 +55,7 @@ def release_delay(actions: np.ndarray) -> int | None:
     return int(right[0] - left[0]) if len(left) and len(right) else None
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run of the transfer task")
@@ -58,18 +63,14 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=100_000, help="of the start states")
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
-    try:
-        env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())
-        log, delays = ActionLog(), {True: Counter(), False: Counter()}
-        actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
-        with Progress("hand-overs", arguments.episodes) as progress:
-            for seed in range(arguments.first_seed, arguments.first_seed + arguments.episodes):
-                result = run_episode(env, actor, seed, [log], kind="rollout", config={})
-                delays[result.success][release_delay(np.stack(log.actions))] += 1
-                progress.advance()
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())
+    log, delays = ActionLog(), {True: Counter(), False: Counter()}
+    actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
+    with Progress("hand-overs", arguments.episodes) as progress:
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.episodes):
+            result = run_episode(env, actor, seed, [log], kind="rollout", config={})
+            delays[result.success][release_delay(np.stack(log.actions))] += 1
+            progress.advance()
     for success, counts in delays.items():
         ordered = sorted(counts.items(), key=lambda item: (item[0] is None, item[0]))
         text = ", ".join(f"{'-' if steps is None else steps}: {count}" for steps, count in ordered)

@@ -4,6 +4,11 @@ python tools/mcap_check.py runs/demos/socket            # every *.mcap below a d
 python tools/mcap_check.py episode.mcap other.mcap
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import sys
 from collections import Counter
@@ -44,6 +49,7 @@ def check(path: Path) -> tuple[Episode, list[str]]:
     return episode, problems
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("paths", nargs="+", type=Path, help="MCAP files, or directories to search for them")

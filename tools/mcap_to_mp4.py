@@ -4,6 +4,11 @@ python tools/mcap_to_mp4.py episode.mcap                   # writes episode.mp4 
 python tools/mcap_to_mp4.py episode.mcap -o film.mp4 --views front top
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import sys
 from collections.abc import Iterator
@@ -35,6 +40,7 @@ def export(source: Path, target: Path, views: list[str] | None) -> None:
     write_mp4(target, frames(episode), CONTROL_HZ / steps_per_frame)
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", nargs="+", type=Path, help="MCAP files")
@@ -43,14 +49,10 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.output and len(arguments.recordings) > 1:
         parser.error("--output is for one recording")
-    try:
-        for source in arguments.recordings:
-            target = arguments.output or source.with_suffix(".mp4")
-            export(source, target, arguments.views)
-            print(target)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    for source in arguments.recordings:
+        target = arguments.output or source.with_suffix(".mp4")
+        export(source, target, arguments.views)
+        print(target)
     return 0
 
 

@@ -6,6 +6,11 @@ python tools/memory.py training --count 2000         # the policy of conf/train.
 Prints the resident memory ten times, and exits with 1 where the last three quarters grew by more than 5 %.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import json
 import sys
@@ -101,6 +106,7 @@ def measure(work: Callable[[int, Watch], None], count: int) -> list[float]:
     return found
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("what", choices=("resets", "training"))

@@ -9,6 +9,11 @@ a step and at its most while the state is saved (Linux), less what it took befor
 where losses differ by more than rounding.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import json
 import os
@@ -111,7 +116,7 @@ def measure(overrides: list[str], run: str) -> None:
         forget_peak()
         save_state(trainer.run.last_state, trainer.state, {}, writes=processes.is_first)
         found["saving"] = peak() - before
-        Path(f"{run}-{processes.rank}.json").write_text(json.dumps(found))
+        Path(f"{run}-{processes.rank}.json").write_text(json.dumps(found), encoding="utf-8")
 
 
 def of_this_process(tensors: Iterable[Tensor]) -> int:
@@ -121,17 +126,20 @@ def of_this_process(tensors: Iterable[Tensor]) -> int:
 
 
 def forget_peak() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
+    Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
 
 
 def peak() -> int:
     """The most resident memory since it was forgotten [bytes]."""
     (line,) = (
-        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
+        line
+        for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        if line.startswith("VmHWM")
     )
     return 1024 * int(line.split()[1])
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="of conf/train.yaml")
@@ -152,7 +160,10 @@ def main() -> int:
             command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
             command += [f"--nproc-per-node={options.processes}", __file__, "--into", run, *settings]
             subprocess.run(command, env=os.environ | ENVIRONMENT, check=True)
-            found = [json.loads(Path(f"{run}-{rank}.json").read_text()) for rank in range(options.processes)]
+            found = [
+                json.loads(Path(f"{run}-{rank}.json").read_text(encoding="utf-8"))
+                for rank in range(options.processes)
+            ]
             most = {name: max(process[name] for process in found) / MIB for name in found[0]}
             curves.append([row["loss"] for row in read_metrics(Path(run) / "metrics.jsonl")])
             print(

@@ -8,28 +8,29 @@ of the reporting band; made_by.json says with which command, commit, seed and re
 curves stay behind, and with --without-weights, for a result that the tables are made from, the weights too.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import json
 import sys
 from pathlib import Path
 
-from imfvla.errors import UserError
 from imfvla.run_directory import RunDirectory
 from imfvla.shipping import ship
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a finished run")
     parser.add_argument("target", type=Path, help="new directory")
     parser.add_argument("--without-weights", action="store_true", help="results alone")
     arguments = parser.parse_args()
-    try:
-        run = RunDirectory(arguments.run)
-        made_by = ship(run, arguments.target, with_weights=not arguments.without_weights)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    run = RunDirectory(arguments.run)
+    made_by = ship(run, arguments.target, with_weights=not arguments.without_weights)
     print(json.dumps(made_by["results"], indent=2))
     return 0
 

@@ -6,6 +6,11 @@ iMF in one evaluation and flow matching and DDPM in 100 must pass; flow matching
 of its derivative flipped must fail the same test. Writes toy.json, toy.svg and toy.png.
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import logging
 import sys
@@ -23,6 +28,7 @@ from imfvla.progress import Progress
 SHOWN = 3000  # samples in a panel
 
 
+@as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/toy"), help="where the results go")
@@ -30,6 +36,7 @@ def main() -> int:
     parser.add_argument("--samples", type=int, default=10_000, help="that are judged")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(1)
     with Progress("eight Gaussians", len(GENERATORS) * arguments.steps) as bar:
@@ -43,7 +50,6 @@ def main() -> int:
             f"{case.generator + f', {case.nfe} evaluations':38} energy distance {quality.energy_distance:.4f}  "
             f"modes {quality.modes} of 8  near {quality.near:.3f}  {verdict} {'pass' if case.must_pass else 'fail'}"
         )
-    arguments.out.mkdir(parents=True, exist_ok=True)
     settings = {name: getattr(arguments, name) for name in ("steps", "samples", "seed")}
     rows = [case.row() for case in cases]
     write_json(arguments.out / "toy.json", {**settings, "cases": rows, "fingerprint": fingerprint(threads=1)})

@@ -186,7 +186,7 @@ def _write_arrays(files: list[Path], part: Path, source: dict[str, Any], progres
     _save(part / "image_steps.npy", np.concatenate(steps))
     _save(part / "state.npy", np.concatenate(states))
     _save(part / "action.npy", np.concatenate(actions))
-    (part / "meta.json").write_text(json.dumps(source | {"episodes": entries}, indent=1))
+    (part / "meta.json").write_text(json.dumps(source | {"episodes": entries}, indent=1), encoding="utf-8")
 
 
 def _save(path: Path, array: np.ndarray) -> None:

@@ -53,9 +53,9 @@ def page(
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{TITLE}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{STYLE.read_text()}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>\n"
+        f"<style>\n{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>\n"
         + "\n".join(sections)
-        + f"\n<script>\n{SCRIPT.read_text()}</script></body></html>\n"
+        + f"\n<script>\n{SCRIPT.read_text(encoding='utf-8')}</script></body></html>\n"
     )
 
 

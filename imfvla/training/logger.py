@@ -59,8 +59,9 @@ class MetricsLogger:
         return {"sums": dict(self._sums), "count": self._count, "skipped": self._skipped}
 
     def close(self) -> None:
-        self._file.close()
-        self._tensorboard.close()
+        with clear_write_errors(self._path):
+            self._file.close()
+            self._tensorboard.close()
 
 
 class SilentLogger(MetricsLogger):

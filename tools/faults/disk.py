@@ -71,7 +71,7 @@ def fails(work: Work, folder: Path, number: int) -> str:
         link.unlink(missing_ok=True)
         link.symlink_to(log)
     code = os.waitstatus_to_exitcode(os.waitpid(start_logging(work, folder, log), 0)[1])
-    words = "".join(log.read_text().strip().splitlines()[-1:]) if log.exists() else ""
+    words = "".join(log.read_text(encoding="utf-8").strip().splitlines()[-1:]) if log.exists() else ""
     if code != 2 or os.strerror(number) not in words:
         raise Differs(f"wanted exit code 2 and {os.strerror(number)!r}, found {code}: {words!r}")
     read_tensors(RunDirectory(folder).last_state)

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.outcome import Differs, compare
-from imfvla.errors import UserError
-from imfvla.jobs import told
-from imfvla.signals import Stopped, stoppable
+from imfvla.command import as_command
 
 POLL_S = 0.001
 Work = Callable[[Path], None]
@@ -30,18 +28,16 @@ def start(work: Work, folder: Path) -> int:
         output = os.open(f"{folder}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(output, 1)
         os.dup2(output, 2)
-        with stoppable():
-            work(folder)
-        code = 0
-    except Stopped as stop:
-        code = stop.exit_code
-    except Exception as error:  # as the entry points tell it
-        found = told(error)
-        is_users = isinstance(found, UserError)
-        print(found if is_users else repr(found), file=sys.stderr, flush=True)
-        code = 2 if is_users else 1
+        code = as_command(lambda: work(folder) and None)()
+    except Exception as error:
+        print(repr(error), file=sys.stderr, flush=True)
     finally:
         os._exit(code)
+
+
+def last_words(folder: Path) -> str:
+    """The end of what the processes of a folder have said."""
+    return Path(f"{folder}.log").read_text(encoding="utf-8")[-500:]
 
 
 def ended(child: int) -> int | None:
@@ -123,7 +119,7 @@ def kill_over(
         elif code == 0:
             return done, during_write
         else:
-            raise Differs(f"exit code {code}: {Path(f'{folder}.log').read_text()[-500:]}")
+            raise Differs(f"exit code {code}: {Path(f'{folder}.log').read_text(encoding='utf-8')[-500:]}")
 
 
 def ended_or_late(child: int, deadline: float) -> bool:
@@ -136,7 +132,9 @@ def undisturbed(work: Work, folder: Path) -> None:
     """Does it once, in a process like those that are killed."""
     _, status = os.waitpid(start(work, folder), 0)
     if code := os.waitstatus_to_exitcode(status):
-        raise Differs(f"the undisturbed run ended with {code}: {Path(f'{folder}.log').read_text()[-500:]}")
+        raise Differs(
+            f"the undisturbed run ended with {code}: {Path(f'{folder}.log').read_text(encoding='utf-8')[-500:]}"
+        )
 
 
 def kills_of(work: Work, leaves: Callable[[Path], dict[str, Any]], amount: int) -> Callable[..., str]:

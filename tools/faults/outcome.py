@@ -39,8 +39,11 @@ def rows_of(folder: Path) -> dict[str, Any]:
     """Everything that evaluations leave, times apart."""
     found: dict[str, Any] = {}
     for rollouts in sorted((folder / "rollouts").iterdir()):
-        rows = [json.loads(line) for line in (rollouts / "episodes.jsonl").read_text().splitlines()]
-        summary = json.loads((rollouts / "summary.json").read_text())
+        rows = [
+            json.loads(line)
+            for line in (rollouts / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+        ]
+        summary = json.loads((rollouts / "summary.json").read_text(encoding="utf-8"))
         same = ("success_episodes", "avg_return", "recordings", "protocol", "episodes", "failures")
         found[f"{rollouts.name} rows"] = [untimed(row) for row in rows]
         found[f"{rollouts.name} summary"] = [summary[key] for key in same]
@@ -62,7 +65,7 @@ def demonstrations_of(folder: Path) -> dict[str, Any]:
                 f"{path.name} {view}": torch.from_numpy(images) for view, images in episode.images.items()
             }
         elif path.suffix not in (".part", ".trial"):  # of a kill; begun anew when its seed is played
-            found[path.name] = path.read_text()
+            found[path.name] = path.read_text(encoding="utf-8")
     return found
 
 

@@ -64,7 +64,7 @@ def sweep(folder: Path, kills: int, rng: random.Random) -> str:
     equal = compare(runs_of(killed), runs_of(whole))
     if done < kills:
         raise Differs(f"ended after {done} of {kills} kills")
-    times = Counter((killed / tiny_sweep.UPDATES).read_text().splitlines())
+    times = Counter((killed / tiny_sweep.UPDATES).read_text(encoding="utf-8").splitlines())
     repeated = sum(times.values()) - len(times)
     steps = size.jobs * size.steps
     if len(times) != steps or repeated > kills:

@@ -108,4 +108,4 @@ def check(code: int, log: Path) -> None:
 
 
 def tail(log: Path) -> str:
-    return log.read_text(errors="replace")[-500:]
+    return log.read_text(encoding="utf-8", errors="replace")[-500:]

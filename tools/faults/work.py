@@ -31,7 +31,7 @@ def roll_out(folder: Path, episodes: int) -> None:
     (run.weights_directory(1) / "policy.safetensors").write_bytes(b"read by nobody")
     observation = {"views": ["front"], "image_size": [16, 16]}
     config = {"name": "chaos", "task": {"name": "fake", "variant": "default"}, "observation": observation}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     workbench._bench.cache_clear()
     evaluate(run, episodes=episodes, first_seed=100_000, nfe=[1], workers=0, build=build_fakes)
 
