@@ -65,6 +65,25 @@ def test_the_table_has_a_row_for_each_measure_and_the_picture_all_its_texts(runs
     assert {"infer1", "infer2", "both", "A alone", "speed, A over B"} <= set(texts(figure))
 
 
+def test_the_verdict_and_the_table_name_the_same_p_value_and_unit(runs):
+    (duel,) = compare(*runs, nfe=[1])
+    table = table_of([duel])
+    success, _, speed = (dict(zip(table.columns, row, strict=True)) for row in table.rows)
+    assert f"points, Holm-corrected p = {success['p (Holm)']})" in verdict(duel).replace("p < ", "p = <")
+    assert {"p (uncorrected)", "p (Holm)"} < set(table.columns)
+    assert speed["A"].endswith("] ms")
+    assert speed["A against B"].startswith("1.33× [1.3")
+    assert all(table.is_numeric(name) for name in ("A", "B", "A against B", "Detectable"))
+
+
+def test_a_difference_of_nothing_is_drawn(tmp_path):
+    """Two equal policies differ by 0 in reward, which is measured."""
+    for name in ("a", "b"):
+        write_evaluation(make_run(tmp_path / name, name), 1)
+    figure = two_runs(compare(tmp_path / "a", tmp_path / "b"))
+    assert "not compared" not in texts(figure)
+
+
 def test_numbers_of_evaluations_may_differ(runs):
     (duel,) = compare(*runs, nfe=[1, 2])
     assert duel.label == "infer1 against infer2"

@@ -56,9 +56,9 @@ def main() -> int:
     data = draw(SHOWN, torch.Generator().manual_seed(arguments.seed + 3)).numpy()
     panels = [
         (
-            f"{case.generator}, {case.nfe}",
+            f"{case.generator}, NFE {case.nfe}",
             f"energy distance {case.quality.energy_distance:.4f}\n"
-            f"{case.quality.modes} modes, {100 * case.quality.near:.0f}% near one",
+            f"{case.quality.modes} of 8 modes, {100 * case.quality.near:.0f}% near one",
             case.quality.passes,
             case.samples[:SHOWN].numpy(),
         )

@@ -31,6 +31,7 @@ STYLE = {
     "svg.fonttype": "path",
     "svg.hashsalt": "imfvla",  # element names, random otherwise
 }
+WIDTH = 8.3  # inches of a figure: at 100 px an inch it fills a README, and 8 points there are 11 px
 DPI = 160
 
 

@@ -13,8 +13,8 @@ from imfvla.reporting.two_runs import Compared, Duel
 
 OUTCOMES = (("both", BLUE), ("A alone", SKY), ("B alone", ORANGE), ("neither", PALE))
 AXES = {
-    "Success": "success, A less B [points]",
-    "Reward": "average reward, A less B",
+    "Success": "success, A minus B [points]",
+    "Reward": "average reward, A minus B",
     "Speed": "speed, A over B",
 }
 
@@ -69,7 +69,7 @@ def _differences(axes: Axes, compared: Sequence[Compared]) -> None:
     known = [
         (place, found)
         for place, found in enumerate(compared)
-        if found.contrast and found.contrast.result.value
+        if found.contrast and found.contrast.result.value is not None
     ]
     for place, found in known:
         result = found.contrast.result.scaled(measure.scale)

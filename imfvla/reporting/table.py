@@ -3,22 +3,22 @@
 import csv
 import io
 import re
-import sys
 from dataclasses import dataclass
+from shutil import get_terminal_size
 
-from rich import box
 from rich.console import Console
-from rich.table import Table as RichTable
 from rich.text import Text
 
 from imfvla.reporting.measured import Measured
+from imfvla.reporting.terminal import fit
 
 WIDE = 160  # characters a line where no terminal says how many it has
 NOTHING = "-"
-MISSING = "missing"
+MISSING, REFUSED = "missing", "refused"
 FILL = "What is missing is filled by:"
 VALUE = r"[-+<]?[\d.]+(?:/\d+)?[%×]?"  # a number, a count of so many, a share, a ratio, a bound
-NUMERIC = rf"{NOTHING}|{MISSING}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?"  # alone or with its interval
+# alone or with its interval, and with its unit
+NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?(?: ms| points)?"
 LATEX = {
     "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
     "×": r"$\times$", "≥": r"$\geq$", "≤": r"$\leq$", "±": r"$\pm$", "–": "--", "'": r"\textquotesingle{}",
@@ -89,19 +89,19 @@ class Table:
         return all(re.fullmatch(NUMERIC, row[index]) for row in self.rows)
 
     def print(self, console: Console | None = None) -> None:
-        """To the terminal, or to `console`."""
+        """To the terminal, or to `console`, in the layout that fits its width."""
         if console is None:
-            console = Console(width=None if sys.stdout.isatty() else WIDE)
-        commands = [FILL, *self.by_command()] if self.commands else []
-        title, note = Text(self.title, "bold"), Text("\n".join((*self.notes, *commands))) or None
-        table = RichTable(
-            title=title, caption=note, box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left"
-        )
-        for name in self.columns:
-            table.add_column(name, justify="right" if self.is_numeric(name) else "left", overflow="fold")
-        for row in self.rows:
-            table.add_row(*map(Text, row))
-        console.print(table)
+            console = Console(width=get_terminal_size((WIDE, 0)).columns)
+        lines = fit(self.columns, self.rows, [self.is_numeric(name) for name in self.columns], console.width)
+        console.print(Text(f"\n{self.title}", "bold"))
+        for line in lines:
+            console.print(Text(line.text, "bold" if line.is_heading else ""), soft_wrap=not line.is_heading)
+        for note in self.notes:
+            console.print(Text(f"\n{note}"))
+        if self.commands:
+            console.print(Text(f"\n{FILL}"))
+        for command in self.by_command():
+            console.print(Text(command), soft_wrap=True)  # in one piece, to be copied
 
 
 def number(value: float | None, digits: int) -> str:

@@ -9,7 +9,7 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import TITLES, PaperRow
 from imfvla.reporting.results import Result
-from imfvla.reporting.table import MISSING, NOTHING, Table, interval, number, with_interval
+from imfvla.reporting.table import MISSING, NOTHING, REFUSED, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.run_directory import LAST
 
@@ -98,7 +98,7 @@ def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) ->
     cells = []
     for found in compared:
         paper = found.comparison.paper
-        ours = MISSING if found.is_missing else "refused" if found.refused else shown(found)
+        ours = MISSING if found.is_missing else REFUSED if found.refused else shown(found)
         cells.append(
             (paper.comparison, paper.metric, paper.result, ours, p_value(found.p), p_value(found.p_holm))
         )
@@ -266,7 +266,7 @@ def _comparison_data(compared: Sequence[Compared]) -> tuple[tuple[str, ...], tup
             (
                 paper.comparison, paper.metric, found.row.name, found.baseline.name, comparison.of,
                 comparison.operation, paper.result, *("" if value is None else f"{value:.6g}" for value in numbers),
-                MISSING if found.is_missing else "refused" if found.refused else "measured", found.refused or "",
+                MISSING if found.is_missing else REFUSED if found.refused else "measured", found.refused or "",
             )
         )  # fmt: skip
     return columns, tuple(cells)

@@ -11,7 +11,7 @@ from imfvla.reporting.power import ALPHA, POWER
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import rows
 from imfvla.reporting.significance import holm
-from imfvla.reporting.table import NOTHING, Table, interval
+from imfvla.reporting.table import NOTHING, REFUSED, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.reporting.tables import COLUMNS, ours, p_value
 from imfvla.run_directory import RunDirectory
@@ -28,10 +28,11 @@ class Measure:
     contrast: Callable[[Pairs], Contrast]
     scale: float
     digits: int
-    unit: str
+    unit: str  # of the contrast
     more: str  # "A {more} B by" so much
     less: str
     neutral: float  # of the contrast where both are alike
+    value_unit: str = ""  # of the column
 
 
 MEASURES = (
@@ -40,7 +41,7 @@ MEASURES = (
         more="succeeds more often than", less="succeeds less often than", neutral=0,
     ),
     Measure("Reward", "Avg. reward", return_difference, 1, 1, "", "earns more than", "earns less than", 0),
-    Measure("Speed", "Latency ms", speedup, 1, 2, "×", "is faster than", "is slower than", 1),
+    Measure("Speed", "Latency ms", speedup, 1, 2, "×", "is faster than", "is slower than", 1, " ms"),
 )  # fmt: skip
 
 
@@ -103,9 +104,11 @@ def table_of(duels: Sequence[Duel]) -> Table:
     for duel in duels:
         both = [dict(zip(COLUMNS[3:], ours(Result([e])), strict=True)) for e in (duel.ours, duel.theirs)]
         for found in duel.compared:
-            values = (cells_of[found.measure.column] for cells_of in both)
-            cells.append((duel.label, found.measure.title, *values, *_difference(found)))
-    columns = ("nfe", "Of", *NAMES, "A against B", "p", "p (Holm)", "Test", "Detectable")
+            measure = found.measure
+            values = (cells_of[measure.column] for cells_of in both)
+            values = (cell if cell == NOTHING else f"{cell}{measure.value_unit}" for cell in values)
+            cells.append((duel.label, measure.title, *values, *_difference(found)))
+    columns = ("nfe", "Measure", *NAMES, "A against B", "p (uncorrected)", "p (Holm)", "Test", "Detectable")
     return Table("Two runs, start by start", columns, tuple(cells), _notes(duels[0]))
 
 
@@ -147,7 +150,7 @@ def _listed(numbers: dict) -> str:
 
 def _difference(found: Compared) -> tuple[str, ...]:
     if found.contrast is None or found.contrast.result.value is None:
-        return ("refused" if found.refused else NOTHING, NOTHING, NOTHING, NOTHING, NOTHING)
+        return (REFUSED if found.refused else NOTHING, NOTHING, NOTHING, NOTHING, NOTHING)
     measure, contrast = found.measure, found.contrast
     detectable = contrast.detectable
     return (
@@ -161,9 +164,11 @@ def _difference(found: Compared) -> tuple[str, ...]:
 
 def _amount(found: Compared) -> str:
     measure, result = found.measure, found.contrast.result.scaled(found.measure.scale)
-    sign = "" if measure.neutral else "+"
-    bounds = interval(result, measure.digits)
-    return f"{result.value:{sign}.{measure.digits}f}{measure.unit} {bounds}".strip()
+    if measure.neutral:
+        return with_interval(result, measure.digits, measure.unit)
+    form = f"+.{measure.digits}f"
+    bounds = "" if result.low is None else f" [{result.low:{form}}, {result.high:{form}}]"
+    return f"{result.value:{form}}{bounds}{measure.unit}"
 
 
 def _sentence(found: Compared) -> str:
@@ -173,7 +178,7 @@ def _sentence(found: Compared) -> str:
     result = found.contrast.result
     if result.value is None:
         return f"{measure.title}: not measured."
-    p = f"p = {p_value(found.p_holm)}".replace("= <", "< ")
+    p = f"Holm-corrected p = {p_value(found.p_holm)}".replace("= <", "< ")
     if not found.is_shown:
         detectable = found.contrast.detectable
         limit = ""
@@ -196,7 +201,8 @@ def _notes(duel: Duel) -> tuple[str, ...]:
     task = f"{protocol['task']} ({protocol['variant']}), seeds {seeds[0]} to {seeds[-1]}"
     return (
         *described,
-        f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A less B, speed is "
-        "B's time over A's. p is two-sided, corrected by Holm over the whole table. Detectable: the least difference "
+        f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A minus B, speed is "
+        "B's time over A's. p is two-sided, of one comparison by itself and as corrected by Holm over the whole table. "
+        "Detectable: the smallest difference "
         f"in favour of A that so many pairs would have shown with probability {POWER} at p = {ALPHA}.",
     )
