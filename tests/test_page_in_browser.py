@@ -16,7 +16,7 @@ from imfvla.reporting.mapping import read_mapping
 pytestmark = pytest.mark.skipif(BINARY is None, reason="chromium is not installed")
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
-WIDTHS = (400, 1400)
+WIDTHS = (400, 1000, 1400)
 
 
 def record(folder: Path, seeds: tuple[int, ...]) -> None:
@@ -64,6 +64,26 @@ def test_nothing_overflows_and_the_console_is_silent(tab, page_file, width):
     )
     assert outside == []
     assert tab.errors == []
+
+
+@pytest.mark.parametrize("width", WIDTHS[1:])
+def test_latency_and_rates_are_seen_without_scrolling(tab, page_file, width):
+    tab.open(page_file, width)
+    heads = tab.run(
+        "[...document.querySelectorAll('table.sortable th')].map((head) =>"
+        " [head.textContent, Math.round(head.getBoundingClientRect().right)])"
+    )
+    ends = [end for name, end in heads if name in ("Latency ms", "Inf. FPS", "Control FPS")]
+    assert len(ends) == 3 * 3  # of Tables 1 and 2 and the evaluations in neither
+    assert max(ends) <= width
+
+
+def test_the_names_of_rows_stay_where_a_narrow_page_is_scrolled(tab, page_file):
+    tab.open(page_file, 400)
+    place = "document.querySelector('table.sortable tbody td').getBoundingClientRect().left"
+    before = tab.run(place)
+    after = tab.run(f"document.querySelector('.scroll').scrollLeft = 300; {place}")
+    assert after == before
 
 
 def test_every_video_plays_and_every_link_leads_into_the_folder(tab, page_file):

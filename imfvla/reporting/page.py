@@ -70,7 +70,7 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
     heads[1:1] = [f'<th aria-sort="none"><button type="button">{ROLLOUTS}</button></th>'] * any(shown)
     lines = []
     for row, keys, rollouts in zip(table.rows, every_keys, shown, strict=True):
-        cells = [escape(cell) for cell in row]
+        cells = [_cell(cell, n) for cell, n in zip(row, numeric, strict=True)]
         if len(keys) == 1 and keys[0] in named:
             cells[0] = f'<a href="#{_anchor(keys[0])}">{cells[0]}</a>'
         elif len(keys) > 1:
@@ -82,6 +82,14 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
     notes = "".join(f'<p class="note">{escape(note)}</p>' for note in table.notes)
     body = f"<thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody>"
     return f'<div class="scroll"><table class="sortable">{body}</table></div>{notes}{_commands(table)}'
+
+
+def _cell(text: str, is_number: bool) -> str:
+    """A number with its interval below it, whose ends may stand below each other where there is little room."""
+    value, bracket, interval = text.partition(" [")
+    if not (is_number and bracket):
+        return escape(text)
+    return f'{escape(value)} <span class="interval">[{escape(interval)}</span>'
 
 
 def _commands(table: Table) -> str:
