@@ -120,13 +120,21 @@ def _figures(
         ),
         "evaluations": (
             success_by_evaluations(every),
-            "Success-like episodes against the number of network evaluations. Bars are Wilson's 95% intervals.",
+            "Success-like episodes against the number of network calls for a chunk. Bars are Wilson's 95% intervals.",
         ),
         "learning": (
             learning_curves(every),
-            "Training loss of every run above. Losses of different generators are measured in different units.",
+            "Training loss of every run above, a panel for each kind of loss: numbers of different panels are in "
+            "different units.",
         ),
-        "failures": (failed_stages(every), "Where episodes end: the first stage that was not reached."),
+        "failures": (
+            failed_stages([*socket, *transfer]),
+            "Where episodes of the tables' rows fail: the first stage that was not reached.",
+        ),
+        "failures_others": (
+            failed_stages(others),
+            "Where episodes of evaluations in no row fail: the first stage that was not reached.",
+        ),
         "depth_attention": (
             depth_attention(_depth_attention(every)),
             "What the sublayers of trained policies read: mean Attention Residual weights over the action tokens.",
@@ -136,6 +144,6 @@ def _figures(
 
 
 def _depth_attention(results: Sequence[Result]) -> list[dict[str, Any]]:
-    runs = dict.fromkeys(found.evaluation.run for result in results for found in result.evaluated)
-    recorded = [found for run in runs if (found := read_depth_attention(run)) is not None]
-    return recorded[:MAX_HEAT_MAPS]
+    runs = {found.evaluation.run: found.evaluation.config for result in results for found in result.evaluated}
+    recorded = (read_depth_attention(run, config.get("core")) for run, config in runs.items())
+    return [found for found in recorded if found is not None][:MAX_HEAT_MAPS]

@@ -71,7 +71,8 @@ def test_latency_and_rates_are_seen_without_scrolling(tab, page_file, width):
     tab.open(page_file, width)
     heads = tab.run(
         "[...document.querySelectorAll('table.sortable th')].map((head) =>"
-        " [head.textContent, head.getBoundingClientRect().right - head.closest('.scroll').getBoundingClientRect().right])"
+        " [head.textContent, head.getBoundingClientRect().right"
+        " - head.closest('.scroll').getBoundingClientRect().right])"
     )
     ends = [end for name, end in heads if name in ("Latency ms", "Inf. FPS", "Control FPS")]
     assert len(ends) == 3 * 3  # of Tables 1 and 2 and the evaluations in neither

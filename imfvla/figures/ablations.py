@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imfvla.figures.reward_latency import errors
-from imfvla.figures.style import BLUE, GREY, INK, new_figure, style
+from imfvla.figures.style import BLUE, GREY, INK, WIDTH, new_figure, style
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.results import Result
 
@@ -17,7 +17,7 @@ BAR = 0.38  # of the distance between two groups
 def transfer_ablations(results: Sequence[Result]) -> Figure:
     """A group for each row, the paper's bar beside ours; 95% intervals on ours and on the paper's counts."""
     with style():
-        figure = new_figure(9.6, 1.4 + 0.36 * len(results))
+        figure = new_figure(WIDTH, 1.4 + 0.36 * len(results))
         axes = figure.subplots(1, 2, sharey=True)
         _bars(
             axes[0],

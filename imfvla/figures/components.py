@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from imfvla.figures.description import BLOCK, STANDARD, Method, describe
+from imfvla.figures.description import BLOCK, STANDARD, Method, describe, listing
 from imfvla.figures.diagram import Sheet
 from imfvla.figures.style import BLUE, GREEN, GREY, ORANGE, PALE, PURPLE, SKY, VERMILION, style
 
@@ -137,17 +137,17 @@ def _training(sheet: Sheet, method: Method) -> None:
     top, each = 23.2, 3.6
     for index, line in enumerate(lines):
         sheet.text(32.5, top - index * each, line, 58, size=8)
-    counts = ", ".join(map(str, method.nfe))
-    text = f"an action chunk for the robot from {counts} network evaluation" + (
-        "" if method.nfe == (1,) else "s"
-    )
+    calls = "call" if method.nfe == (1,) else "calls"
+    text = f"an action chunk for the robot from {listing(method.nfe)} {calls} of the network"
     sheet.box(6, 3.6, 53, 5, [text], face="white", edge=PURPLE, size=8, rounding=0.8)
 
 
 def _residuals(sheet: Sheet, method: Method) -> None:
     attends = method.residual != STANDARD
     title = "Attention Residuals" if attends else "Fixed residual sums"
-    title = f"{title}: {method.depth} blocks, {method.num_sublayers} sublayers"
+    title = (
+        f"{title}: {method.depth} blocks of {len(method.sublayers)} sublayers, {method.num_sublayers} in all"
+    )
     sheet.box(65, 2, 61, 36, title=title, face="#fdf3e1")
     names, faces = _sources(method)
     left, width, y = 69.0, 42.0, 22.5

@@ -5,17 +5,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
-from imfvla.figures.style import GREY, INK, new_figure, style
+from imfvla.figures.description import TWO_SUBLAYERS, sublayers_of
+from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
 
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
+COLUMNS = 2
+TICKS = (0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1)
+BRIGHT = 0.3  # a weight whose colour wants dark writing
+SHORT = {"attention": "attn", "cross-attention": "cross"}
 
 
-def read_depth_attention(run: Path) -> dict[str, Any] | None:
-    """What a run directory recorded, None where nothing is. Raises UserError for a file that cannot be read."""
+def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
+    """What a run directory recorded, None where nothing is; `core` is that of its config.
+
+    Raises UserError for a file that cannot be read.
+    """
     path = run / FILE
     if not path.exists():
         return None
@@ -26,29 +35,30 @@ def read_depth_attention(run: Path) -> dict[str, Any] | None:
         found["experiment"], found["checkpoint_step"]
     except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
         raise UserError(f"{path} holds no depth weights: {error!r}; {remedy}.") from error
-    return found
+    return found | {"sublayers": sublayers_of(core) if core else TWO_SUBLAYERS}
 
 
 def depth_attention(recorded: Sequence[Mapping[str, Any]]) -> Figure:
     """A map for each policy: reading sublayer downwards, source to the right; rows sum to one."""
     with style():
-        figure = new_figure(max(4.8 * len(recorded), 4.8), 4.4)
+        columns = min(max(len(recorded), 1), COLUMNS)
+        rows = -(-max(len(recorded), 1) // columns)
+        figure = new_figure(WIDTH, 0.4 + 3.9 * rows)
         if not recorded:
             figure.text(
                 0.5, 0.5, f"no run has {FILE}:\npython tools/depth_attention.py RUN", ha="center", color=GREY
             )
             return figure
-        axes = figure.subplots(1, len(recorded), squeeze=False)[0]
+        axes = figure.subplots(rows, columns, squeeze=False)
+        for axis in axes.flat[len(recorded) :]:
+            axis.set_axis_off()
         matrices = [_matrix(found["actions"]) for found in recorded]
-        brightest = max(
-            np.nanmax(weights[1:], initial=0.1) for weights in matrices
-        )  # the first row has one source
-        for axis, found, weights in zip(axes, recorded, matrices, strict=True):
-            image = axis.imshow(weights, cmap="cividis", vmin=0, vmax=brightest, aspect="auto")
+        for axis, found, weights in zip(axes.flat, recorded, matrices, strict=False):
+            image = axis.imshow(weights, cmap="cividis", norm=PowerNorm(0.5, 0, 1), aspect="auto")
             axis.set_title(f"{found['experiment']}, step {found['checkpoint_step']}")
             axis.grid(visible=False)
             axis.set_xlabel("source")
-            sublayers = [_sublayer(index + 1) for index in range(len(weights))]
+            sublayers = _sublayers(len(weights), found.get("sublayers", TWO_SUBLAYERS))
             sources = ["emb.", *sublayers][: weights.shape[1]]
             if weights.shape[1] < len(weights):  # sums of blocks of sublayers
                 sources = ["emb.", *(f"sum {index}" for index in range(1, weights.shape[1]))]
@@ -58,10 +68,12 @@ def depth_attention(recorded: Sequence[Mapping[str, Any]]) -> Figure:
                 for (row, column), value in np.ndenumerate(weights):
                     if not np.isnan(value):
                         shown = f"{value:.2f}".removeprefix("0")
-                        axis.text(column, row, shown, ha="center", va="center", fontsize=6,
-                                  color=INK if value > brightest / 2 else "white")  # fmt: skip
-        axes[0].set_ylabel("sublayer that reads")
-        figure.colorbar(image, ax=list(axes), shrink=0.8, label="mean weight over action tokens")
+                        axis.text(column, row, shown, ha="center", va="center", fontsize=7,
+                                  color=INK if value > BRIGHT else "white")  # fmt: skip
+        for axis in axes[:, 0]:
+            axis.set_ylabel("sublayer that reads")
+        bar = figure.colorbar(image, ax=axes, shrink=0.8, aspect=30, label="mean weight over action tokens")
+        bar.set_ticks(TICKS, labels=[f"{tick:g}" for tick in TICKS])
     return figure
 
 
@@ -74,5 +86,8 @@ def _matrix(rows: Sequence[Sequence[float]]) -> np.ndarray:
     return matrix
 
 
-def _sublayer(number: int) -> str:
-    return f"{(number + 1) // 2} {'attn' if number % 2 else 'MLP'}"
+def _sublayers(number: int, of_block: Sequence[str]) -> list[str]:
+    """Block and kind of each, such as "1 attn"; an aggregation after the last block is the output's."""
+    names = [SHORT.get(name, name) for name in of_block]
+    known = [f"{block + 1} {name}" for block in range(number // len(names)) for name in names]
+    return [*known, *["output"] * (number - len(known))]

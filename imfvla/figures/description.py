@@ -1,6 +1,6 @@
 """What a composed training config says about the method, in the words and numbers of its figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,9 @@ CORE = {
     "CrossAttentionCore": "cross-attention to the context",
     "AdaptiveNormCore": "adaptive norms (DiT)",
 }
+# of a block, in the order in which they run (the `num_sublayers` of the core's block)
+SUBLAYERS = {"CrossAttentionCore": ("attention", "cross-attention", "MLP")}
+TWO_SUBLAYERS = ("attention", "MLP")
 GENERATOR = {
     "ImprovedMeanFlow": "improved Mean Flow",
     "MeanFlow": "Mean Flow",
@@ -41,6 +44,7 @@ class Method:
     vision_residual: str  # STANDARD or ATTENTION
     view_tokens: int | None  # of each view
     core: str
+    sublayers: tuple[str, ...]  # of each block
     depth: int
     width: int
     heads: int
@@ -65,7 +69,7 @@ class Method:
 
     @property
     def num_sublayers(self) -> int:
-        return 2 * self.depth
+        return len(self.sublayers) * self.depth
 
     @property
     def is_improved_mean_flow(self) -> bool:
@@ -87,6 +91,7 @@ def describe(config: Mapping[str, Any]) -> Method:
         vision_residual=encoder.get("vision", {}).get("residual", STANDARD),
         view_tokens=encoder.get("view_tokens", {}).get("tokens"),
         core=_name(core, CORE),
+        sublayers=sublayers_of(core),
         depth=core["depth"],
         width=core["width"],
         heads=core["heads"],
@@ -105,6 +110,18 @@ def describe(config: Mapping[str, Any]) -> Method:
         pred=config["horizon"]["pred"],
         exec=config["horizon"]["exec"],
     )
+
+
+def sublayers_of(core: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a block of a configured core is made of."""
+    return SUBLAYERS.get(_class(core), TWO_SUBLAYERS)
+
+
+def listing(numbers: Sequence[int]) -> str:
+    """As in "1, 2 or 3"."""
+    if len(numbers) == 1:
+        return str(numbers[0])
+    return f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"
 
 
 def _class(part: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Success against the number of network evaluations, one panel a task, one line a policy."""
+"""Success against the number of network evaluations: a panel for each method on each task, a line for each change."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -7,54 +7,77 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from imfvla.figures.panels import TASKS, legend_below, look, say_nothing_yet, task_panels
+from imfvla.figures.names import policy_of
+from imfvla.figures.panels import TASKS, look, say_nothing_yet
 from imfvla.figures.reward_latency import errors
-from imfvla.figures.style import style
+from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.results import Result
-from imfvla.reporting.runs import Evaluation
+
+COLUMNS = 3
+Line = list[Result]
 
 
 def success_by_evaluations(results: Sequence[Result]) -> Figure:
-    """Of policies evaluated with several numbers, with the weights of the end of their training and Wilson intervals.
-
-    What a policy does with another scale of noise has its colour, and a hollow marker.
-    """
+    """Of policies evaluated with several numbers, with the weights at the end of training and Wilson intervals."""
     last = sorted((result for result in results if result.is_last), key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]
-    by_task = {task: [line for line in lines if line[0].task == task] for task in TASKS}
-    most = max(map(len, by_task.values()))
+    panels = {task: _by_method([line for line in lines if line[0].task == task]) for task in TASKS}
+    changes = list(dict.fromkeys(_policy(line)[1] for line in lines if line[0].task in TASKS))
+    rows = {task: -(-max(len(of_task), 1) // COLUMNS) for task, of_task in panels.items()}
     with style():
-        figure, axes = task_panels(3.8, most)
-        for task, axis in axes.items():
-            _panel(axis, by_task[task])
-            legend_below(axis, lines=most)
+        figure = new_figure(WIDTH, 0.7 + 2.7 * sum(rows.values()))
+        parts = figure.subfigures(len(TASKS), 1, height_ratios=list(rows.values()))
+        for part, task in zip(parts, TASKS, strict=True):
+            part.suptitle(TASKS[task], x=0.01, ha="left", fontsize=11, weight="bold")
+            axes = part.subplots(rows[task], COLUMNS, sharey=True, squeeze=False)
+            _task(axes.ravel().tolist(), panels[task], changes)
+            for side in axes[:, 0]:
+                side.set_ylabel("success-like [%]")
+        handles = {
+            label: handle
+            for part in parts
+            for axis in part.axes
+            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=3)
     return figure
 
 
-def _panel(axes: Axes, lines: Sequence[Sequence[Result]]) -> None:
-    axes.set_xlabel("network evaluations, log axis")
-    axes.set_ylabel("success-like episodes [%]")
+def _by_method(lines: Sequence[Line]) -> dict[str, list[Line]]:
+    found: dict[str, list[Line]] = {}
+    for line in lines:
+        found.setdefault(_policy(line)[0], []).append(line)
+    return found
+
+
+def _task(axes: Sequence[Axes], methods: dict[str, list[Line]], changes: Sequence[str]) -> None:
+    for axis in axes[max(len(methods), 1) :]:
+        axis.set_axis_off()
+    if not methods:
+        say_nothing_yet(axes[0], "no policy measured\nwith several numbers yet")
+    for axis, (method, lines) in zip(axes, methods.items(), strict=False):
+        axis.set_title(method)
+        _panel(axis, lines, changes)
+    lowest = min((axis.dataLim.y0 for axis in axes[: len(methods)]), default=0)
+    axes[0].set_ylim(max(-3, 10 * (lowest // 10) - 3), 103)
+
+
+def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
+    axes.set_xlabel("network calls for a chunk (NFE)")
     axes.set_xscale("log")
-    trainings = list(dict.fromkeys(_evaluation(line).policy for line in lines))
     for number, line in enumerate(lines):
-        evaluation = _evaluation(line)
         shares = [result.metrics["success_share"].scaled(100) for result in line]
-        shift = 1 + 0.02 * (number - (len(lines) - 1) / 2)  # so that intervals do not hide each other
+        shift = 1.1 ** (number - (len(lines) - 1) / 2)  # so that intervals do not hide each other
         x, y = [shift * result.nfe for result in line], [share.value for share in shares]
-        how = look(trainings.index(evaluation.policy))
-        if not evaluation.is_usual:
-            how |= {"linestyle": "--", "markerfacecolor": "white"}
-        axes.errorbar(x, y, yerr=errors(shares), capsize=2.5, label=evaluation.label, **how)
-    if not lines:
-        say_nothing_yet(axes, "no policy measured with several numbers yet")
-    lowest = axes.dataLim.y0 if lines else 0
-    axes.set_ylim(max(-3, 10 * (lowest // 10) - 3), 103)
-    ticks = sorted({result.nfe for line in lines for result in line}) or [1, 10, 100]
+        change = _policy(line)[1]
+        axes.errorbar(x, y, yerr=errors(shares), capsize=2, label=change, markersize=4.5, linewidth=1.2,
+                      **look(changes.index(change)))  # fmt: skip
+    ticks = sorted({result.nfe for line in lines for result in line})
     axes.set_xlim(0.75 * ticks[0], 1.35 * ticks[-1])
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def _evaluation(line: Sequence[Result]) -> Evaluation:
-    return line[0].evaluated[0].evaluation
+def _policy(line: Line) -> tuple[str, str]:
+    return policy_of(line[0].evaluated[0].evaluation)

@@ -1,17 +1,16 @@
-"""Where episodes end: a histogram of the first stage that was not reached, one panel a task."""
+"""Where episodes end: of those without success, the first stage that was not reached, a bar for each result."""
 
-import re
 from collections import Counter
 from collections.abc import Sequence
-from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from imfvla.figures.panels import TASKS, legend_below, say_nothing_yet, task_panels
-from imfvla.figures.style import GREEN, INK, VERMILION, style
+from imfvla.figures.names import result_name
+from imfvla.figures.panels import TASKS, say_nothing_yet
+from imfvla.figures.style import INK, VERMILION, WIDTH, new_figure, style
 from imfvla.reporting.metrics import Row
 from imfvla.reporting.results import Result
 
@@ -20,6 +19,8 @@ STAGES = {
     "transfer": ("grasp", "lift", "both hold", "handed over"),
 }
 SHADES = LinearSegmentedColormap.from_list("failures", [VERMILION, "#fbe3d0"])
+BAR, FRAME = 0.19, 1.25  # inches: of a bar with its gap, of what is above and below the bars of a panel
+LEAST = 4  # percent that a number within a bar needs
 
 
 def first_failed_stage(row: Row) -> int | None:
@@ -28,20 +29,27 @@ def first_failed_stage(row: Row) -> int | None:
 
 
 def failed_stages(results: Sequence[Result]) -> Figure:
-    """A bar for each row: the shares of episodes whose first failed stage is each of the stages, and of successes."""
+    """A bar for each result: the share of episodes whose first failed stage is each of the stages."""
     measured = [result for result in results if not result.is_missing]
-    rows = {task: [result for result in measured if result.task == task] for task in TASKS}
+    rows = {task: _sorted([result for result in measured if result.task == task]) for task in TASKS}
+    heights = [FRAME + BAR * max(len(found), 2) for found in rows.values()]
     with style():
-        lines = max((_name(result).count("\n") + 1 for result in measured), default=1)
-        figure, axes = task_panels(1.4 + (0.14 + 0.08 * lines) * max(map(len, rows.values())), 2)
-        for task, axis in axes.items():
-            _bars(axis, STAGES[task], rows[task])
+        figure = new_figure(WIDTH, sum(heights))
+        for part, task in zip(figure.subfigures(len(TASKS), 1, height_ratios=heights), TASKS, strict=True):
+            axes = part.subplots()
+            axes.set_title(TASKS[task], weight="bold")
+            _bars(axes, STAGES[task], rows[task])
     return figure
 
 
+def _sorted(results: Sequence[Result]) -> list[Result]:
+    """Results of a name side by side, names in their order, numbers of evaluations ascending."""
+    names = list(dict.fromkeys(map(result_name, results)))
+    return sorted(results, key=lambda result: (names.index(result_name(result)), result.nfe))
+
+
 def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
-    axes.set_xlabel("episodes [%], by first failed stage")
-    axes.set_xlim(0, 100)
+    axes.set_xlabel("episodes that fail [%], by the first stage that they do not reach")
     axes.grid(axis="y", visible=False)
     if not results:
         say_nothing_yet(axes, "no row measured yet")
@@ -49,25 +57,23 @@ def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
         return
     counts = [Counter(first_failed_stage(row) for row in result.episodes) for result in results]
     places, left = np.arange(len(results)), np.zeros(len(results))
-    for stage in (*range(len(stages)), None):
+    for stage, label in enumerate(stages):
         shares = np.array([100 * count[stage] / count.total() for count in counts])
-        color = GREEN if stage is None else SHADES(stage / (len(stages) - 1))
-        label = "none failed" if stage is None else stages[stage]
-        axes.barh(places, shares, 0.7, left=left, color=color, edgecolor="white", linewidth=0.5, label=label)
+        color = SHADES(stage / (len(stages) - 1))
+        axes.barh(places, shares, 0.75, left=left, color=color, edgecolor="white", linewidth=0.5, label=label)
         for place, share, start in zip(places, shares, left, strict=True):
-            if share >= 8:
-                dark = stage is None or stage == 0
-                axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center", fontsize=6.5,
-                          color="white" if dark else INK)  # fmt: skip
+            if share >= LEAST:
+                axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center", fontsize=7.5,
+                          color="white" if stage == 0 else INK)  # fmt: skip
         left += shares
-    axes.set_yticks(places, [_name(result) for result in results], fontsize=7)
+    for place, end in zip(places, left, strict=True):
+        axes.text(end + 0.5, place, f"{round(end, 1):g}", va="center", fontsize=8, weight="bold")
+    names = [result_name(result) for result in results]
+    shown = [name if place == 0 or names[place - 1] != name else "" for place, name in enumerate(names)]
+    blank = "\N{FIGURE SPACE}"  # as wide as a digit
+    labels = [f"{name}   NFE {result.nfe:{blank}>3}" for name, result in zip(shown, results, strict=True)]
+    axes.set_yticks(places, labels, fontsize=8)
+    axes.tick_params(axis="y", length=0)
     axes.set_ylim(len(results) - 0.4, -0.6)
-    legend_below(axes, columns=3)
-
-
-def _name(result: Result) -> str:
-    """In short lines where it stands in no table, since it is long then, and without the training's last step."""
-    if result.row:
-        return result.name
-    name = f"{result.policy}, infer{result.nfe}" if result.is_last else result.name
-    return "\n".join(wrap(re.sub("[/,] ?", ", ", name), 36))
+    axes.set_xlim(0, max(1.08 * max(left), 10))
+    axes.figure.legend(loc="outside lower center", ncols=len(stages))

@@ -1,44 +1,117 @@
-"""Learning curves: the loss of every run against its steps, one panel a task."""
+"""Learning curves: the loss of every run against its steps. Losses of one kind share a panel, others do not."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from textwrap import wrap
+from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from imfvla.figures.panels import TASKS, legend_below, look, plain_log_ticks, say_nothing_yet, task_panels
-from imfvla.figures.style import style
+from imfvla.figures.description import GENERATOR
+from imfvla.figures.names import training_of
+from imfvla.figures.panels import TASKS, look, plain_log_ticks, say_nothing_yet
+from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.results import Result
+from imfvla.reporting.runs import Evaluation
+
+COLUMNS, PANEL, LEGEND_LINE = 3, 1.9, 0.165  # panels in a row, inches, inches
+TITLE, NAME = 36, 38  # characters a line
+OUTPUTS = {"data": "clean action as output", "velocity": "velocity as output"}  # by parametrisation
+# what gives the loss of a generator other units: curves that differ in it are not compared
+UNITS = (
+    "parametrisation", "prediction", "times", "time_power", "adaptive_power", "compound_target", "instant_weight",
+    "kl_weight",
+)  # fmt: skip
+Curves = dict[str, tuple[np.ndarray, np.ndarray]]  # steps and losses by name
 
 
 def learning_curves(results: Sequence[Result]) -> Figure:
-    """Of all runs with an evaluation. Losses of different generators are measured in different units."""
-    curves = {task: _curves([result for result in results if result.task == task]) for task in TASKS}
+    """Of all runs with an evaluation: a panel for each task and kind of loss, most curves first."""
+    panels = {task: _curves([result for result in results if result.task == task]) for task in TASKS}
+    rows = {task: _rows(of_task) for task, of_task in panels.items()}
+    heights = {
+        task: [PANEL + LEGEND_LINE * max(_lines(curves) for _, curves in row) for row in found]
+        for task, found in rows.items()
+    }
     with style():
-        figure, axes = task_panels(3.8, max(map(len, curves.values())))
-        for task, axis in axes.items():
-            axis.set_xlabel("training step")
-            axis.set_ylabel("training loss, log axis")
-            axis.set_yscale("log")
-            for number, (label, (steps, loss)) in enumerate(curves[task].items()):
-                axis.plot(steps, loss, label=label, linewidth=1.3, **look(number) | {"marker": ""})
-            plain_log_ticks(axis.yaxis, (1, 2, 3, 4, 5, 6, 7, 8))
-            if not curves[task]:
-                say_nothing_yet(axis, "no curve yet")
-            legend_below(axis, lines=max(map(len, curves.values())))
+        totals = [0.3 + sum(of_task) for of_task in heights.values()]
+        figure = new_figure(WIDTH, sum(totals))
+        for part, task in zip(figure.subfigures(len(TASKS), 1, height_ratios=totals), TASKS, strict=True):
+            part.suptitle(TASKS[task], x=0.01, ha="left", fontsize=11, weight="bold")
+            cells = part.subfigures(len(rows[task]), COLUMNS, height_ratios=heights[task], squeeze=False)
+            for of_row, row in zip(cells, rows[task], strict=True):
+                for cell, (title, curves) in zip(of_row, row, strict=False):
+                    _panel(cell.subplots(), title, curves)
     return figure
 
 
-def _curves(results: Sequence[Result]) -> dict:
-    """Steps and losses of each run, by policy and training seed; of a run's several evaluations the first names it."""
-    found, read = {}, set()
-    for result in results:
-        for evaluated in result.evaluated:
-            evaluation = evaluated.evaluation
-            if evaluation.run in read:
-                continue
-            read.add(evaluation.run)
-            seed = f", seed {evaluation.training_seed}" if evaluation.training_seed else ""
-            steps, loss = learning_curve(evaluation.run)
-            if steps.size:
-                found[f"{result.policy}{seed}"] = steps, loss
-    return found
+def _panel(axes: Axes, title: str, curves: Curves) -> None:
+    axes.set_title("\n".join(wrap(title, TITLE)), fontsize=9)
+    axes.set_xlabel("training step")
+    axes.set_ylabel("loss, log axis")
+    axes.set_yscale("log")
+    for number, (label, (steps, loss)) in enumerate(curves.items()):
+        axes.plot(steps, loss, label=label, linewidth=1.2, **look(number) | {"marker": ""})
+    plain_log_ticks(axes.yaxis, (1, 2, 3, 4, 5, 6, 8))
+    if curves:
+        axes.figure.legend(loc="outside lower left", fontsize=7.5, borderpad=0, labelspacing=0.3)
+    else:
+        say_nothing_yet(axes, "no curve yet")
+
+
+def _lines(curves: Curves) -> int:
+    """Of the legend."""
+    return sum(name.count("\n") + 1 for name in curves)
+
+
+def _rows(curves: Mapping[str, Curves]) -> list[list[tuple[str, Curves]]]:
+    panels = sorted(curves.items(), key=lambda panel: -len(panel[1])) or [("", {})]
+    return [panels[start : start + COLUMNS] for start in range(0, len(panels), COLUMNS)]
+
+
+def _curves(results: Sequence[Result]) -> dict[str, Curves]:
+    """Of each run, by kind of loss; those of several training seeds of a policy say theirs."""
+    runs = {found.evaluation.run: found.evaluation for result in results for found in result.evaluated}
+    kinds: dict[str, list[tuple[Evaluation, tuple[np.ndarray, np.ndarray]]]] = {}
+    for evaluation in runs.values():
+        steps, loss = learning_curve(evaluation.run)
+        if steps.size:
+            kinds.setdefault(json.dumps(_kind(evaluation)), []).append((evaluation, (steps, loss)))
+    titles = _titles([json.loads(kind) for kind in kinds])
+    return {
+        title: {_name(evaluation): curve for evaluation, curve in found}
+        for title, found in zip(titles, kinds.values(), strict=True)
+    }
+
+
+def _kind(evaluation: Evaluation) -> dict[str, Any]:
+    """The generator, and what of it the numbers of the loss hang on."""
+    generator = evaluation.config.get("generator", {})
+    units = {key: generator[key] for key in UNITS if key in generator}
+    return {"class": _class(generator), **units}
+
+
+def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The name of each generator, with what tells it from others of its class."""
+    titles = []
+    for kind in kinds:
+        rivals = [other for other in kinds if other["class"] == kind["class"] and other != kind]
+        told = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
+        value = kind.get(told)
+        detail = OUTPUTS.get(str(value), f"{told} {_class(value) if isinstance(value, dict) else value}")
+        name = GENERATOR.get(kind["class"], kind["class"] or "training loss")
+        titles.append(f"{name}, {detail}" if told else name)
+    return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]
+
+
+def _class(part: Mapping[str, Any]) -> str:
+    return part.get("_target_", "").rpartition(".")[2]
+
+
+def _name(evaluation: Evaluation) -> str:
+    name, changes = training_of(evaluation)
+    seed = [f"seed {evaluation.training_seed}"] if evaluation.training_seed else []
+    return "\n".join(wrap(", ".join([name, *changes, *seed]), NAME))

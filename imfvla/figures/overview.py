@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from imfvla.figures.description import ATTENTION, BLOCK, STANDARD, Method, describe
+from imfvla.figures.description import ATTENTION, BLOCK, STANDARD, Method, describe, listing
 from imfvla.figures.diagram import Sheet
 from imfvla.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, SKY, VERMILION, style
 
@@ -82,7 +82,7 @@ def _core(sheet: Sheet, method: Method) -> None:
         y = bottom + index * each
         sheet.box(64, y + 0.12 * each, 17, 0.76 * each, edge=ORANGE, rounding=min(0.5, each / 4))
         if each > 3:
-            sheet.text(72.5, y + each / 2, "attention, MLP", 15, size=6.5)
+            sheet.text(72.5, y + each / 2, ", ".join(method.sublayers), 15, size=6.5)
     middles = [bottom + (index + 0.5) * each for index in range(shown)]
     sources = [bottom - 1.0, *middles]
     if method.residual == STANDARD:
@@ -123,8 +123,9 @@ def _generator(sheet: Sheet, method: Method) -> None:
         y = top - index * each - 1.0
         sheet.text(94.2, y, f"infer{nfe}", 8, size=7.5, weight="bold")
         _steps(sheet, left, right, y, nfe)
-    plural = "evaluation" if rows == (1,) else "evaluations"
-    sheet.text(107.75, 24.6, f"{_listing(rows)} network {plural};\nthe context is encoded once", 34, size=7)
+    plural = "call" if rows == (1,) else "calls"
+    text = f"{listing(rows)} {plural} of the network;\nthe context is encoded once"
+    sheet.text(107.75, 24.6, text, 34, size=7)
 
 
 def _steps(sheet: Sheet, left: float, right: float, y: float, nfe: int) -> None:
@@ -145,7 +146,7 @@ def _steps(sheet: Sheet, left: float, right: float, y: float, nfe: int) -> None:
 def _robot(sheet: Sheet, method: Method) -> None:
     sheet.box(2, 2, 124, 13, face=FACES["robot"])
     names = {"socket": "socket peg insertion", "transfer": "object transfer"}
-    sheet.text(14, 10.6, "RoboIMI", 22, size=9, weight="bold")
+    sheet.text(14, 10.6, "MuJoCo simulation", 22, size=9, weight="bold")
     sheet.text(14, 6.6, names.get(method.task, method.task), 22, size=7.5)
     colors = [BLUE] * method.exec + [PALE] * (method.pred - method.exec)
     sheet.cells(45, 7.2, colors, width=68, height=3.4, edge=GREY)
@@ -159,9 +160,3 @@ def _robot(sheet: Sheet, method: Method) -> None:
     sheet.path([(107.75, 20), (107.75, 11.4)])
     sheet.path([(44, 8.9), (28, 8.9)])
     sheet.path([(12.5, 15), (12.5, 19.4)])
-
-
-def _listing(numbers: tuple[int, ...]) -> str:
-    if len(numbers) == 1:
-        return str(numbers[0])
-    return f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D, Bbox
 
 from imfvla.figures.panels import plain_log_ticks
-from imfvla.figures.style import BLACK, CYCLE, GREY, MARKERS, new_figure, style
+from imfvla.figures.style import BLACK, CYCLE, GREY, MARKERS, WIDTH, new_figure, style
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.results import Result
@@ -34,7 +34,7 @@ def reward_latency(results: Sequence[Result]) -> Figure:
     ours = [_ours(result) for result in results if not result.is_missing]
     methods = list(dict.fromkeys(point.method for point in (*printed, *ours) if point))
     with style():
-        figure = new_figure(9.6, 4.4)
+        figure = new_figure(WIDTH, 4.6)
         axes = figure.subplots(1, 2, sharey=True)
         _panel(axes[0], "Paper (its machines)", [p for p in printed if p], methods)
         _panel(axes[1], "Here", [p for p in ours if p], methods)
@@ -49,7 +49,7 @@ def reward_latency(results: Sequence[Result]) -> Figure:
             handles,
             loc="outside lower center",
             ncols=min(len(handles), 4),
-            title="beside points: network evaluations of a chunk",
+            title="beside points: network calls for a chunk (NFE)",
             title_fontsize=8,
         )
         figure.draw_without_rendering()  # places of labels are measured on the final layout

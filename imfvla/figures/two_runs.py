@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from imfvla.figures.panels import say_nothing_yet
 from imfvla.figures.reward_latency import errors
-from imfvla.figures.style import BLUE, GREY, INK, ORANGE, PALE, SKY, new_figure, style
+from imfvla.figures.style import BLUE, GREY, INK, ORANGE, PALE, SKY, WIDTH, new_figure, style
 from imfvla.reporting.two_runs import Compared, Duel
 
 OUTCOMES = (("both", BLUE), ("A alone", SKY), ("B alone", ORANGE), ("neither", PALE))
@@ -22,7 +22,7 @@ AXES = {
 def two_runs(duels: Sequence[Duel]) -> Figure:
     """A line for each pair of evaluations; intervals are 95%, filled where a difference is shown."""
     with style():
-        figure = new_figure(10.4, 1.5 + 0.5 * len(duels))
+        figure = new_figure(WIDTH, 1.5 + 0.5 * len(duels))
         outcomes, *differences = figure.subplots(1, 1 + len(AXES), sharey=True, width_ratios=[1.5, 1, 1, 1])
         _outcomes(outcomes, duels)
         for number, axes in enumerate(differences):

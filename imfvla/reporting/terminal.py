@@ -27,7 +27,12 @@ class Line:
 
 
 def fit(columns: Row, rows: Sequence[Row], numeric: Sequence[bool], width: int) -> list[Line]:
-    """The table in the first layout that `width` characters hold; `numeric` columns are aligned to the right."""
+    """The table in the first layout that `width` characters hold; `numeric` columns are aligned to the right.
+
+    Without rows there is nothing to lay out.
+    """
+    if not rows:
+        return []
     layouts: tuple[tuple[Callable[..., Iterator[Line]], int], ...] = (
         (_whole, 1), (_grouped, 2), (_grouped, 3), (_turned, 1), (_turned, 2), (_turned, 3),
     )  # fmt: skip

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from seen import clipped, texts
-from synthetic_runs import answer_row, episodes_of
+from synthetic_runs import answer_row, episodes_of, make_run, write_evaluation
 
 from imfvla.errors import UserError
 from imfvla.figures.ablations import transfer_ablations
@@ -83,19 +83,68 @@ def test_the_first_failed_stage_by_hand():
     assert first_failed_stage(row | {"first_step_of_stage": [-1, -1]}) == 0
 
 
-def test_bars_of_failures_fill_a_hundred_percent(results):
-    for axes in failed_stages(results).axes:
+def test_a_bar_of_failures_ends_at_their_share(results):
+    for axes, task in zip(failed_stages(results).axes, ("socket", "transfer"), strict=True):
         ends = [bar.get_x() + bar.get_width() for bar in axes.containers[-1]]
-        np.testing.assert_allclose(ends, 100)
+        shares = [100 - 100 * found.metrics["success_share"].value for found in results if found.task == task]
+        np.testing.assert_allclose(sorted(ends), sorted(shares), atol=1e-9)
+
+
+def test_results_of_a_method_stand_together_under_its_name(results):
+    socket = failed_stages(of_table(results, 1)).axes[0]
+    names = [label.get_text().replace("\N{FIGURE SPACE}", "") for label in socket.get_yticklabels()]
+    first = names.index("Flow, high-noise times   NFE 1")
+    assert [name.strip() for name in names[first + 1 : first + 3]] == ["NFE 2", "NFE 10"]
+    assert "iMF-AttnRes, weights of step 200   NFE 1" in names  # of a third of the training
+    assert not any("=" in name for name in names)
 
 
 def test_weights_at_the_end_of_training_are_compared_over_evaluations(results):
-    socket, _ = success_by_evaluations(results).axes
-    lines = {bars.get_label(): len(bars.lines[0].get_xdata()) for bars in socket.containers}
-    assert lines["socket_ph32_exec16"] == 2  # one evaluation is answered by a third of the training
-    assert lines["socket_ddpm_ph32_exec16"] == 4
-    assert lines["socket_ph32_exec16/generator=flow_high_noise"] == 3
-    assert "socket_act" not in lines  # a single evaluation is no line
+    panels = success_by_evaluations(of_table(results, 1)).axes
+    lines = {
+        axes.get_title(loc="left"): [len(bars.lines[0].get_xdata()) for bars in axes.containers]
+        for axes in panels
+    }
+    assert lines["iMF-AttnRes"] == [2]  # one evaluation is answered by a third of the training
+    assert lines["Diffusion-style VLA, ph32, exec16"] == [4]
+    assert lines["Flow, high-noise times"] == [3]
+    assert "ACT" not in lines  # a single evaluation is no line
+
+
+def test_changes_of_a_method_share_its_panel(tmp_path):
+    """Chunks from no noise, and demonstrations without the hidden choice."""
+    plain = make_run(tmp_path / "socket_ph32_exec16" / "default", "socket_ph32_exec16")
+    unimodal = make_run(tmp_path / "socket_ph32_exec16" / "task.expert.modes=1", "socket_ph32_exec16")
+    for run, protocol in ((plain, {}), (plain, {"noise_scale": 0.0}), (unimodal, {})):
+        for nfe in (1, 2):
+            write_evaluation(run, nfe, number=100, **protocol)
+    found = [Result(evaluated) for evaluated in Sources([tmp_path]).others([])]
+    panel, *_ = success_by_evaluations(found).axes
+    assert panel.get_title(loc="left") == "iMF-AttnRes"
+    labels = sorted(bars.get_label() for bars in panel.containers)
+    assert labels == ["as in the tables", "chunks from no noise", "unimodal demonstrations"]
+
+
+def test_losses_in_different_units_share_no_panel(tmp_path):
+    """Improved Mean Flow, and flow matching with either output."""
+    generators = {
+        "imf": {"_target_": "imfvla.generators.imf.ImprovedMeanFlow", "parametrisation": "data"},
+        "flow": {"_target_": "imfvla.generators.flow.FlowMatching", "parametrisation": "data"},
+        "velocity": {"_target_": "imfvla.generators.flow.FlowMatching", "parametrisation": "velocity"},
+    }
+    for name, generator in generators.items():
+        for seed in (0, 1):
+            run = make_run(tmp_path / name / f"seed={seed}", name, seed=seed, generator=generator)
+            write_evaluation(run, 1, number=100)
+    figure = learning_curves([Result(evaluated) for evaluated in Sources([tmp_path]).others([])])
+    panels = {axes.get_title(loc="left").replace("\n", " "): len(axes.lines) for axes in figure.axes}
+    assert panels == {
+        "improved Mean Flow": 2,
+        "flow matching, clean action as output": 2,
+        "flow matching, velocity as output": 2,
+        "": 0,
+    }
+    assert {"imf", "imf, seed 1"} <= set(texts(figure))
 
 
 def test_a_learning_curve_without_its_cut_off_last_line(tmp_path):
@@ -117,6 +166,10 @@ def test_depth_weights_as_recorded(tmp_path):
     assert {"e, step 5", "1.00", ".25", ".75", "emb.", "1 attn", "1 MLP"} <= set(texts(figure))
     image = figure.axes[0].images[0].get_array()
     np.testing.assert_array_equal(image.filled(-1), [[1, -1, -1], [0.25, 0.75, -1], [0.5, 0.25, 0.25]])
+    assert figure.axes[0].images[0].get_clim() == (0, 1)  # so that no two weights look alike
+    core = {"_target_": "imfvla.nn.cross.CrossAttentionCore"}
+    shown = texts(depth_attention([read_depth_attention(tmp_path, core)]))
+    assert {"1 attn", "1 cross", "1 MLP"} <= set(shown)
 
 
 def test_no_depth_weights_and_broken_ones(tmp_path):

@@ -100,6 +100,18 @@ def test_other_methods_are_named_and_their_text_fits(overrides, overview, compon
         assert not clipped(figure)
 
 
+@pytest.mark.parametrize("conditioning", ["token", "adaln", "cross"])
+def test_sublayers_are_counted_as_the_core_counts_them(conditioning):
+    config = compose("train", ["+exp=socket_ph32_exec16", f"core/conditioning={conditioning}"])
+    block = build_policy(config).core.block
+    method = describe(config)
+    assert len(method.sublayers) == block.num_sublayers
+    assert method.num_sublayers == block.num_sublayers * config["core"]["depth"]
+    shown = " ".join(texts(method_components(config)))
+    assert f"4 blocks of {block.num_sublayers} sublayers, {4 * block.num_sublayers} in all" in shown
+    assert ", ".join(method.sublayers) in texts(method_overview(config))
+
+
 def test_tokens_are_counted_as_the_policy_counts_them(config):
     encoder = build_policy(config).encoder
     context = encoder.summary.in_features // config["core"]["width"] + 1

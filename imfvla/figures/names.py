@@ -1,0 +1,71 @@
+"""How figures call what was trained: by the method of the tables' row, and by what was changed about it."""
+
+import re
+from functools import cache
+
+from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.results import Result
+from imfvla.reporting.runs import Evaluation
+
+USUAL = "as in the tables"
+CHANGES = {"task.expert.modes=1": "unimodal demonstrations"}
+# of a row's setting, what is no part of a policy: the number of evaluations, and the paper's own steps of training
+NOT_TRAINED = re.compile(r"infer\d+|\d+k|step\d+")
+
+
+def training_of(evaluation: Evaluation) -> tuple[str, list[str]]:
+    """Method of a policy and what was changed about it, such as ("L1 regression", ["unimodal demonstrations"])."""
+    found = _nearest(evaluation.experiment, evaluation.key)
+    if found is None:
+        return evaluation.experiment, _split(evaluation.key)
+    changes = [text for text in _split(evaluation.key) if text not in found.overrides]
+    return _trained(found), [CHANGES.get(text, text) for text in changes]
+
+
+def policy_of(evaluation: Evaluation) -> tuple[str, str]:
+    """As `training_of`, with an unusual noise among the changes; USUAL where there are none."""
+    name, changes = training_of(evaluation)
+    if not evaluation.is_usual:
+        scale = evaluation.noise_scale
+        changes = [*changes, "chunks from no noise" if scale == 0 else f"noise scaled by {scale:g}"]
+    return name, ", ".join(changes) or USUAL
+
+
+def result_name(result: Result) -> str:
+    """The policy of a result; of a row of the tables the method that the table names, with its weights' share."""
+    evaluation = result.evaluated[0].evaluation
+    name, change = policy_of(evaluation)
+    if result.row and not _is_shared(result.row):
+        name = result.row.method
+    if change != USUAL:
+        name = f"{name}, {change}"
+    return name if result.is_last else f"{name}, weights of step {evaluation.summary['checkpoint_step']}"
+
+
+def _split(key: str) -> list[str]:
+    """Overrides in the name of a run directory; a comma within one is followed by no `key=`."""
+    return re.split(r",(?=[^,=]+=)", key) if key else []
+
+
+@cache
+def _nearest(experiment: str, key: str) -> TableRow | None:
+    """The first row of an experiment whose overrides are all among those of a run; of several that with most."""
+    given = set(_split(key))
+    rows = [
+        row for row in read_mapping().rows if row.experiment == experiment and given >= set(row.overrides)
+    ]
+    return max(rows, key=lambda row: len(row.overrides), default=None)
+
+
+def _is_shared(row: TableRow) -> bool:
+    """Whether several trainings of a table go by the method's name."""
+    rows = [other for other in read_mapping().of_table(row.table) if other.method == row.method]
+    return len({(other.experiment, other.overrides) for other in rows}) > 1
+
+
+def _trained(row: TableRow) -> str:
+    """A name of the training that answers a row, unique in its table."""
+    if not _is_shared(row):
+        return row.method
+    parts = [part for part in row.setting.split(", ") if not NOT_TRAINED.fullmatch(part)]
+    return f"{row.method}, {', '.join(parts)}"
