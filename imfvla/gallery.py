@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from imfvla.entry import entry_point
+from imfvla.episode import CONTROL_HZ
 from imfvla.files import write_together
 from imfvla.options import require
 
-MARGIN = 6  # px between pictures
+MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
 
 
 @entry_point("gallery")
@@ -38,9 +39,8 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
 
     Columns are the views, rows the moments of the episode: start, a quarter, middle and end.
     """
-    import cv2  # with tasks, here: a slip in the config is told at once
-
-    from imfvla import tasks
+    from imfvla import tasks  # here, with what draws: a mistake in the config is told at once
+    from imfvla.figures.contact_sheet import contact_sheet, png
 
     env = tasks.load(task["name"], variant=task["variant"])
     directory.mkdir(parents=True, exist_ok=True)
@@ -48,10 +48,10 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
     seed, experts = _both_ways(env, task, seed)
     for label, expert in experts.items():
         frames = _play(env, expert, seed, size)
-        chosen = [frames[round(share * (len(frames) - 1))] for share in (0, 0.25, 0.5, 1)]
+        chosen = [frames[round(share * (len(frames) - 1))] for share in MOMENTS]
+        rows = [(f"{step / CONTROL_HZ:.1f} s", pictures) for step, pictures in chosen]
         path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
-        _, picture = cv2.imencode(".png", _sheet(chosen)[:, :, ::-1])
-        write_together({path: picture.tobytes()})
+        write_together({path: png(contact_sheet(rows, env.all_views))})
         paths.append(path)
     env.close()
     return paths
@@ -71,26 +71,19 @@ def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[
         seed += 1
 
 
-def _play(env: Any, expert: Any, seed: int, size: int, every: int = 10) -> list[list[np.ndarray]]:
-    """Pictures of all views every few steps of an episode, of its first and last state among them."""
+def _play(env: Any, expert: Any, seed: int, size: int, every: int = 10) -> list[tuple[int, list[np.ndarray]]]:
+    """Steps done and pictures of all views every few steps of an episode, its first and last state among them."""
     env.reset(seed)
     expert.reset(env, seed)
     frames = []
     for step in range(env.time_limit_steps):
         if step % every == 0:
-            frames.append([env.render(view, size, size) for view in env.all_views])
+            frames.append((step, [env.render(view, size, size) for view in env.all_views]))
         env.step(expert.act(env, env.state(), step).executed)
         if expert.done(env):
             break
-    frames.append([env.render(view, size, size) for view in env.all_views])
+    frames.append((step + 1, [env.render(view, size, size) for view in env.all_views]))
     return frames
-
-
-def _sheet(rows: list[list[np.ndarray]]) -> np.ndarray:
-    """The pictures as one, with white margins."""
-    pad = ((MARGIN, 0), (MARGIN, 0), (0, 0))
-    lines = [np.concatenate([np.pad(p, pad, constant_values=255) for p in row], axis=1) for row in rows]
-    return np.concatenate(lines)
 
 
 if __name__ == "__main__":
