@@ -62,7 +62,9 @@ def test_the_table_has_a_row_for_each_measure_and_the_picture_all_its_texts(runs
     ]
     figure = two_runs(duels)
     assert not clipped(figure)
-    assert {"infer1", "infer2", "both", "A alone", "speed, A over B"} <= set(texts(figure))
+    assert {"infer1", "infer2", "both succeeded", "A alone succeeded", "speed, A over B"} <= set(
+        texts(figure)
+    )
 
 
 def test_the_verdict_and_the_table_name_the_same_p_value_and_unit(runs):

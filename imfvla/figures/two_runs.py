@@ -5,24 +5,26 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from imfvla.figures.panels import say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import BLUE, GREY, INK, ORANGE, PALE, SKY, WIDTH, new_figure, style
+from imfvla.reporting.power import ALPHA
 from imfvla.reporting.two_runs import Compared, Duel
 
 OUTCOMES = (("both", BLUE), ("A alone", SKY), ("B alone", ORANGE), ("neither", PALE))
 AXES = {
-    "Success": "success, A minus B [points]",
-    "Reward": "average reward, A minus B",
+    "Success": "success,\nA minus B [points]",
+    "Reward": "average reward,\nA minus B",
     "Speed": "speed, A over B",
 }
 
 
 def two_runs(duels: Sequence[Duel]) -> Figure:
-    """A line for each pair of evaluations; intervals are 95%, filled where a difference is shown."""
+    """A line for each pair of evaluations; intervals are 95%, points filled where a difference is shown."""
     with style():
-        figure = new_figure(WIDTH, 1.5 + 0.5 * len(duels))
+        figure = new_figure(WIDTH, 1.9 + 0.5 * len(duels))
         outcomes, *differences = figure.subplots(1, 1 + len(AXES), sharey=True, width_ratios=[1.5, 1, 1, 1])
         _outcomes(outcomes, duels)
         for number, axes in enumerate(differences):
@@ -32,9 +34,11 @@ def two_runs(duels: Sequence[Duel]) -> Figure:
         )
         outcomes.set_ylim(len(duels) - 0.4, -0.6)
         handles, labels = outcomes.get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=len(labels), title="succeeded from a start"
-        )
+        labels = [f"{label} succeeded" for label in labels]
+        for face, text in ((BLUE, f"a difference: Holm-corrected p < {ALPHA}"), ("white", "none shown")):
+            handles.append(Line2D([], [], marker="o", linestyle="", color=BLUE, markerfacecolor=face))
+            labels.append(text)
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
     return figure
 
 
@@ -71,6 +75,9 @@ def _differences(axes: Axes, compared: Sequence[Compared]) -> None:
         for place, found in enumerate(compared)
         if found.contrast and found.contrast.result.value is not None
     ]
+    for place in set(range(len(compared))) - {place for place, _ in known} if known else ():
+        axes.text(0.5, place, "not compared", transform=axes.get_yaxis_transform(), ha="center", va="center",
+                  fontsize=7.5, color=GREY)  # fmt: skip
     for place, found in known:
         result = found.contrast.result.scaled(measure.scale)
         face = BLUE if found.is_shown else "white"
