@@ -29,7 +29,7 @@ def transfer_ablations(results: Sequence[Result]) -> Figure:
         _bars(axes[1], results, "success-like episodes [%]", [r.paper_success_share.scaled(100) for r in results],
               [r.metrics["success_share"].scaled(100) for r in results])  # fmt: skip
         axes[0].set_yticks(
-            range(len(results)), [f"{r.row.method}\n{r.row.setting}" for r in results], fontsize=7
+            range(len(results)), [f"{r.row.method}\n{r.row.setting}" for r in results], fontsize=7.5
         )
         axes[0].set_ylim(len(results) - 0.4, -0.6)
         handles, labels = axes[0].get_legend_handles_labels()

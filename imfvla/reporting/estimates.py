@@ -8,22 +8,22 @@ import math
 import numpy as np
 from scipy import stats
 
-from imfvla.reporting.bootstrap import TAILS, bootstrap
+from imfvla.reporting.bootstrap import TAILS, Statistic, bootstrap
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import wilson_interval
 
 
 def mean(values: np.ndarray) -> Measured:
-    return bootstrap(np.mean, values).measured
+    return _located(np.mean, values)
 
 
 def median(values: np.ndarray) -> Measured:
-    return bootstrap(np.median, values).measured
+    return _located(np.median, values)
 
 
 def interquartile_mean(values: np.ndarray) -> Measured:
     """Mean without the lowest and the highest quarter, each rounded down (R. Agarwal et al., arXiv:2108.13264)."""
-    return bootstrap(trimmed, values).measured
+    return _located(trimmed, values)
 
 
 def pooled_mean(totals: np.ndarray, counts: np.ndarray) -> Measured:
@@ -81,6 +81,14 @@ def share_difference(ours: np.ndarray, theirs: np.ndarray) -> Measured:
         difference - distance(value - low, their_high - their_value),
         difference + distance(high - value, their_value - their_low),
     )
+
+
+def _located(statistic: Statistic, values: np.ndarray) -> Measured:
+    """With few training seeds an interval is stretched: of numbers that are never negative, no further than to 0."""
+    found = bootstrap(statistic, values).measured
+    if found.low is None or np.min(values) < 0:
+        return found
+    return Measured(found.value, max(found.low, 0.0), found.high)
 
 
 def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:

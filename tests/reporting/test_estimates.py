@@ -25,6 +25,14 @@ def test_the_three_middles_by_hand():
         assert VALUES.min() <= found.low < found.value < found.high <= VALUES.max()
 
 
+def test_an_interval_of_rewards_is_never_negative():
+    """Two trainings, one of which did nothing: the interval is stretched far, but not below what can be."""
+    values = np.stack([np.full(20, 1000.0), np.zeros(20)])
+    for estimate in (estimates.mean, estimates.median, estimates.interquartile_mean):
+        assert estimate(values).low == 0
+    assert estimates.mean(values - 1).low < 0
+
+
 def test_a_pooled_mean_weighs_every_number_alike():
     totals, counts = np.array([10.0, 30.0, 8.0, 0.0]), np.array([2, 10, 2, 0])
     found = estimates.pooled_mean(totals, counts)
