@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def pictures(*arguments: str) -> subprocess.CompletedProcess:
     command = [sys.executable, str(ROOT / "tools" / "pictures.py"), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, encoding="utf-8", check=False)
 
 
 def test_every_picture_of_the_documents_has_a_name_there():

@@ -6,6 +6,11 @@ python tools/pictures.py two_sentences --multitask runs/multitask/default     # 
 python tools/pictures.py toy --toy runs/toy                                   # after tools/toy.py --out runs/toy
 """
 
+from imfvla.command import as_command, begin
+
+if __name__ == "__main__":
+    begin()
+
 import argparse
 import io
 import sys
@@ -71,7 +76,8 @@ class Snapshots:
             self.pictures.append(env.render(self.view, SIZE, SIZE))
 
 
-def main() -> int:
+@as_command
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     names = [*FIGURES, "rollouts", "socket"]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}, two_sentences, toy")
@@ -87,23 +93,18 @@ def main() -> int:
         parser.error(
             f"unknown picture {', '.join(unknown)}; there are {', '.join(names)}, two_sentences, toy"
         )
-    try:
-        made = figures([name for name in chosen if name in FIGURES])
-        if "rollouts" in chosen:
-            made["rollouts"] = png(rollouts())
-        if "socket" in chosen:
-            made["socket"] = expert()
-        if "two_sentences" in chosen:
-            made["two_sentences"] = png(two_sentences(arguments.multitask))
-        if "toy" in chosen:
-            made["toy"] = shrunk(arguments.toy / "toy.png")
-        write_together({arguments.out / f"{name}.png": content for name, content in made.items()})
-    except UserError as error:
-        print(error, file=sys.stderr)
-        return 2
+    made = figures([name for name in chosen if name in FIGURES])
+    if "rollouts" in chosen:
+        made["rollouts"] = png(rollouts())
+    if "socket" in chosen:
+        made["socket"] = expert()
+    if "two_sentences" in chosen:
+        made["two_sentences"] = png(two_sentences(arguments.multitask))
+    if "toy" in chosen:
+        made["toy"] = shrunk(arguments.toy / "toy.png")
+    write_together({arguments.out / f"{name}.png": content for name, content in made.items()})
     for name, content in made.items():
         print(f"{arguments.out / name}.png, {len(content) / 1000:.0f} kB")
-    return 0
 
 
 def figures(names: list[str]) -> dict[str, bytes]:
