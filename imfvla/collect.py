@@ -16,8 +16,9 @@ def main(config: dict[str, Any]) -> None:
 
     demos = {key: value for key, value in config.items() if key not in ("task", "observation")}
     report = collect(config["task"], config["observation"], demos)
+    found = report.recordings
     print(
-        f"{report.directory}: {report.num_episodes} demonstrations, {report.num_new} of them new in "
+        f"{found.directory}: {len(found.files)} demonstrations, {report.num_new} of them new in "
         f"{report.wall_s:.0f} s; {report.num_failed} failed and were left out."
     )
 

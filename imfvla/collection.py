@@ -1,7 +1,7 @@
 """Demonstrations: episodes of the scripted expert, one MCAP file each, recorded on all cores."""
 
 import json
-import os
+import logging
 import re
 import time
 from collections.abc import Mapping
@@ -12,18 +12,19 @@ from typing import Any
 
 from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
-from imfvla.files import locked, write_json
+from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
 from imfvla.options import build, require
 from imfvla.progress import Progress
-from imfvla.recording import McapSink, episode_is_complete
+from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.rollout import run_episode
+from imfvla.views import ViewOptions
 
 SEED_LIMIT = 10_000  # demonstrations may use the seeds below
 LOG_NAME = "collection.json"
-EPISODE_TIMEOUT_S = (
-    900.0  # a demonstration takes seconds; a worker that takes longer hangs in its graphics driver
-)
+# A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
+EPISODE_TIMEOUT_S = 900.0
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,7 @@ class DemoOptions:
     episodes: int
     first_seed: int
     directory: str
+    frames_directory: str | None  # of the frame store, see imfvla.training.data
     camera_every: int
     workers: int | None
 
@@ -57,14 +59,6 @@ class ExpertOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class ViewOptions:
-    """What is filmed."""
-
-    views: tuple[str, ...]
-    image_size: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
 class Settings:
     """What the content of a folder of demonstrations depends on beside the seeds. Hashable, sent to the workers."""
 
@@ -82,64 +76,70 @@ class Settings:
 class Report:
     """What a collection did."""
 
-    directory: Path
-    num_episodes: int
+    recordings: Recordings  # exactly those that were asked for
     num_new: int
     num_failed: int  # among the seeds up to the last one needed
     wall_s: float
 
 
-def ensure_demonstrations(config: Mapping[str, Any]) -> Path:
-    """The folder with exactly the demonstrations that `config` (train.yaml composed) asks for.
+def ensure_demonstrations(config: Mapping[str, Any]) -> Recordings:
+    """Exactly the demonstrations that `config` (train.yaml composed) asks for.
 
     What is missing is collected first. Raises UserError as `collect` does.
     """
-    return collect(config["task"], config["observation"], config["demos"]).directory
+    return collect(config["task"], config["observation"], config["demos"]).recordings
+
+
+def read_options(
+    task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any]
+) -> tuple[DemoOptions, Settings]:
+    """The checked options of a collection. Raises UserError on bad ones."""
+    options = build(DemoOptions, demos, "demos")
+    expert = build(ExpertOptions, task["expert"], "task.expert")
+    seen = build(ViewOptions, {key: observation[key] for key in ("views", "image_size")}, "observation")
+    return options, Settings(
+        task=task["name"],
+        variant=task["variant"],
+        **asdict(expert),
+        **asdict(seen),
+        camera_every=options.camera_every,
+    )
 
 
 def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any]) -> Report:
     """Records demonstrations until `demos.episodes` have succeeded, from `demos.first_seed` on.
 
     Each success becomes `episode-<seed>.mcap` in a folder of `demos.directory` named after task, variant, modes and
-    image size. Complete files are kept, so that an interrupted collection goes on; the seeds of failed demonstrations
+    image size. Complete files are kept, so that an interrupted collection resumes; the seeds of failed demonstrations
     are listed in `collection.json`. The seeds that are used depend on the settings alone, not on how the work was
-    shared out. Where the folder holds more than is asked for, a folder of links to those asked for is returned.
+    shared out. Other files of the folder are left alone and not used.
 
     Raises:
         UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
     """
-    options = build(DemoOptions, demos, "demos")
-    expert = build(ExpertOptions, task["expert"], "task.expert")
-    shown = build(ViewOptions, {k: observation[k] for k in ("views", "image_size")}, "observation")
-    settings = Settings(
-        task=task["name"],
-        variant=task["variant"],
-        **asdict(expert),
-        views=shown.views,
-        image_size=shown.image_size,
-        camera_every=options.camera_every,
-    )
+    options, settings = read_options(task, observation, demos)
     began = time.perf_counter()
     height, width = settings.image_size
     name = f"{settings.task}-{settings.variant}-modes{settings.modes}-{height}x{width}"
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may want the same demonstrations
-        log = _Log(directory, settings)
-        chosen = {seed for seed in _seeds_on_file(directory) if episode_is_complete(_path(directory, seed))}
+        listed = _Log(directory, settings)
+        chosen = {seed for seed in _seeds_on_file(directory) if _is_recorded(directory, seed, settings)}
         workers = physical_cores() if options.workers is None else options.workers
-        num_new = _record_missing(directory, settings, options, workers, log, chosen)
+        num_new = _record_missing(directory, settings, options, workers, listed, chosen)
         wanted = sorted(seed for seed in chosen if seed >= options.first_seed)[: options.episodes]
-        num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in log.failed)
+        num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in listed.failed)
         if len(wanted) < len(_seeds_on_file(directory)):
-            directory = _link_folder(directory, wanted, options)
-    return Report(directory, len(wanted), num_new, num_failed, time.perf_counter() - began)
+            name = f"{name}-seeds{options.first_seed}-n{options.episodes}"
+    names = [_path(directory, seed).name for seed in wanted]
+    return Report(Recordings.named(directory, names, name), num_new, num_failed, time.perf_counter() - began)
 
 
 def _record_missing(
-    directory: Path, settings: Settings, options: DemoOptions, workers: int, log: "_Log", chosen: set[int]
+    directory: Path, settings: Settings, options: DemoOptions, workers: int, listed: "_Log", chosen: set[int]
 ) -> int:
     """Adds to `chosen` the seeds that succeed until there are enough; returns how many were recorded."""
-    batch = _next_batch(options, chosen, log.failed)
+    batch = _next_batch(options, chosen, listed.failed)
     if not batch:
         return 0
     from imfvla.workers import worker_pool
@@ -154,10 +154,10 @@ def _record_missing(
                 if success:
                     chosen.add(seed)
                     num_new += 1
-                    bar.advance(f"{len(log.failed)} failed")
+                    bar.advance(f"{len(listed.failed)} failed")
                 else:
-                    log.add_failure(seed)
-            batch = _next_batch(options, chosen, log.failed)
+                    listed.add_failure(seed)
+            batch = _next_batch(options, chosen, listed.failed)
     return num_new
 
 
@@ -175,7 +175,7 @@ def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> lis
     if num_good + len(batch) == options.episodes:
         return batch
     raise UserError(
-        f"demos.episodes={options.episodes} cannot be had: the seeds for demonstrations end at {SEED_LIMIT - 1}, "
+        f"demos.episodes={options.episodes} cannot be collected: the seeds for demonstrations end at {SEED_LIMIT - 1}, "
         f"and from {options.first_seed} on {len(failed)} failed; ask for fewer or lower demos.first_seed."
     )
 
@@ -184,18 +184,18 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     """Plays the expert from `seed` into its file; of a failed demonstration no file is left. Runs in a worker."""
     env, expert = _stage_for(settings)
     path = _path(directory, seed)
-    trial = path.with_suffix(
-        ".mcap.trial"
-    )  # until it has succeeded: a kill must not leave a failure under its name
+    # Until it has succeeded: a kill must not leave a failure under its name.
+    trial = path.with_suffix(".mcap.trial")
     sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
     sentences = {"paraphrases": env.paraphrases}
     result = run_episode(
         env, expert, seed, [sink], kind="demonstration", config=asdict(settings), metadata=sentences
     )
-    if result.success:
-        trial.replace(path)
-    else:
-        trial.unlink()
+    with clear_write_errors(path):
+        if result.success:
+            trial.replace(path)
+        else:
+            trial.unlink()
     return seed, result.success
 
 
@@ -211,35 +211,48 @@ def _stage_for(settings: Settings) -> tuple[Any, Any]:
 
 
 class _Log:
-    """`collection.json`: what the folder was recorded with and which seeds failed."""
+    """`collection.json`: what the folder was recorded with and which seeds failed.
+
+    A folder without any recording takes other settings, so that a collection that failed at once blocks nothing.
+    """
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._path = directory / LOG_NAME
+        self._remedy = f"choose another demos.directory, or move {directory} away to record it again"
         env, _ = _stage_for(settings)
         self._settings = json.loads(json.dumps(asdict(settings))) | {"model": env.model_digest()}
         self.failed: set[int] = set()
+        is_empty = next(directory.glob("episode-*.mcap"), None) is None
         if self._path.exists():
-            self._read()
-        else:
-            self._write()
+            found, failed = self._read()
+            differing = [key for key, wanted in self._settings.items() if found.get(key) != wanted]
+            if not differing:
+                self.failed = failed
+                return
+            if not is_empty:
+                key = differing[0]
+                raise UserError(
+                    f"{directory} was recorded with {key}={found.get(key)!r}, but {self._settings[key]!r} is wanted; "
+                    f"{self._remedy}."
+                )
+        elif not is_empty:
+            raise UserError(
+                f"{directory} holds recordings, but no {LOG_NAME} that says what they were recorded with: restore "
+                f"it, or {self._remedy}."
+            )
+        self._write()
 
     def add_failure(self, seed: int) -> None:
         self.failed.add(seed)
         self._write()
 
-    def _read(self) -> None:
-        remedy = f"choose another demos.directory, or remove {self._path.parent} to record it anew"
+    def _read(self) -> tuple[dict[str, Any], set[int]]:
+        """The settings and the seeds that failed."""
         try:
             found = parse_json(read_text(self._path, MAX_JSON_BYTES))
-            settings, self.failed = dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
+            return dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
         except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-            raise UserError(f"{self._path} is damaged ({error}); {remedy}.") from error
-        for key, wanted in self._settings.items():
-            if settings.get(key) != wanted:
-                raise UserError(
-                    f"{self._path.parent} was recorded with {key}={settings.get(key)!r}, but {wanted!r} is wanted; "
-                    f"{remedy}."
-                )
+            raise UserError(f"{self._path} is damaged ({error}); {self._remedy}.") from error
 
     def _write(self) -> None:
         write_json(self._path, {"settings": self._settings, "failed_seeds": sorted(self.failed)})
@@ -250,20 +263,34 @@ def _path(directory: Path, seed: int) -> Path:
 
 
 def _seeds_on_file(directory: Path) -> list[int]:
-    found = (re.fullmatch(r"episode-(\d{1,9})", path.stem) for path in directory.glob("episode-*.mcap"))
-    return sorted(int(match.group(1)) for match in found if match)
+    """The seeds whose recordings are there, and a word on files that are none of them."""
+    seeds, others = [], []
+    for path in sorted(directory.glob("*.mcap")):
+        found = re.fullmatch(r"episode-(\d{6})", path.stem)
+        if found:
+            seeds.append(int(found.group(1)))
+        else:
+            others.append(path.name)
+    if others:
+        log.warning(
+            f"{directory} holds files that are no demonstrations of its collection and are not used: "
+            f"{', '.join(map(repr, others))}."
+        )
+    return seeds
 
 
-def _link_folder(directory: Path, seeds: list[int], options: DemoOptions) -> Path:
-    """A folder beside `directory` that links to the recordings of `seeds` alone, rebuilt where it differs."""
-    folder = directory.with_name(f"{directory.name}-seeds{options.first_seed}-n{options.episodes}")
-    folder.mkdir(exist_ok=True)
-    wanted = {_path(folder, seed).name for seed in seeds}
-    for path in folder.glob("episode-*.mcap"):
-        if path.name not in wanted:
-            path.unlink()
-    for name in wanted:
-        if not (folder / name).exists():
-            (folder / name).unlink(missing_ok=True)
-            os.symlink(Path("..") / directory.name / name, folder / name)
-    return folder
+def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:
+    """Whether the recording of `seed` is whole; UserError where its file holds another episode."""
+    path = _path(directory, seed)
+    try:
+        info = read_index(path).info
+    except TruncatedRecording:
+        return False
+    found = (info.kind, info.task, info.seed, info.views, info.image_size)
+    wanted = ("demonstration", settings.task, seed, settings.views, settings.image_size)
+    if found != wanted:
+        raise UserError(
+            f"{path} must hold kind, task, seed, views and image size {wanted}, found {found}: it came here under "
+            "another's name; move it away."
+        )
+    return True

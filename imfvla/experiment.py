@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.collection import ensure_demonstrations
+from imfvla.collection import ensure_demonstrations, read_options
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
@@ -62,6 +62,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     optim = build(OptimOptions, config["optim"], "optim")
     evaluation = build(EvaluationOptions, config["evaluation"], "evaluation")
     build(Horizon, config["horizon"], "horizon")
+    read_options(config["task"], config["observation"], config["demos"])
     policy = build_policy(config)  # what does not fit together is told before demonstrations are collected
     if not run.last_state.exists() and training.steps not in run.weight_steps():
         initialise_from_pretrained(policy)

@@ -122,12 +122,16 @@ def clear_write_errors(path: Path) -> Any:
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            remedy = "free some space there and run the same command again; what was written before is intact"
-        elif error.errno in (errno.EMFILE, errno.ENFILE):
-            remedy = "no file handle is left: raise the limit (ulimit -n 4096) and run the same command again"
-        else:
-            remedy = (
-                "check that the directory is there and may be written to, then run the same command again"
-            )
-        raise UserError(f"Cannot write {path}: {error.strerror or error}; {remedy}.") from error
+        reason = error.strerror or error
+        raise UserError(f"Cannot write {path}: {reason}; {write_remedy(error)}.") from error
+
+
+def write_remedy(error: OSError) -> str:
+    """What helps against a failed write."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "free some space there and run the same command again; what was written before is intact"
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "no file handle is left: raise the limit (ulimit -n 4096) and run the same command again"
+    if error.errno == errno.EFBIG:
+        return "raise the limit on the size of files (ulimit -f), or choose another directory"
+    return "check that the directory is there and may be written to, then run the same command again"

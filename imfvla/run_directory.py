@@ -32,6 +32,7 @@ EXECUTION_KEYS = (
     "evaluation",
     "demos.workers",
     "demos.directory",
+    "demos.frames_directory",
     "training.threads",
     "training.compile",
     "training.sharding",

@@ -16,7 +16,8 @@ OBSERVATION = {"views": ["front", "r_wrist"], "image_size": [24, 32]}
 
 def demos(directory: Path, **changes) -> dict:
     return {
-        "episodes": 2, "first_seed": 0, "directory": str(directory), "camera_every": 8, "workers": 0, **changes,
+        "episodes": 2, "first_seed": 0, "directory": str(directory), "frames_directory": None,
+        "camera_every": 8, "workers": 0, **changes,
     }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from imfvla.evaluation import evaluate
 from imfvla.nn.residual import AttentionResidual
 from imfvla.options import build
 from imfvla.policy import build_policy
+from imfvla.recording import Recordings
 from imfvla.reporting.mapping import read_mapping
 from imfvla.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
@@ -80,7 +81,7 @@ def test_the_reading_of_each_printed_row_is_that_of_its_config(row):
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, tmp_path, monkeypatch):
     config = compose("train", [f"+exp={experiment}", *TINY])
-    windows = prepare_windows(config, demonstrations)
+    windows = prepare_windows(config, Recordings.of(demonstrations))
     run = RunDirectory(tmp_path)
     run.claim(config)
 
@@ -134,7 +135,7 @@ def interrupt() -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations):
-    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), demonstrations)
+    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), Recordings.of(demonstrations))
     config = compose("train", [f"+exp={experiment}", "scale=paper"])
     build(TrainingOptions, config["training"], "training")
     policy = build_policy(config, tiny.statistics())
@@ -159,7 +160,7 @@ def test_exec_beyond_pred_is_refused():
 
 def test_batches_depend_on_seed_and_number_alone(demonstrations):
     config = compose("train", TINY)
-    windows = prepare_windows(config, demonstrations)
+    windows = prepare_windows(config, Recordings.of(demonstrations))
     one, other = make_loader(config, windows), make_loader(config, windows)
     next(one)
     other.load_state_dict(one.state_dict())

@@ -10,6 +10,7 @@ from imfvla import experiment
 from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.experiment import run_experiment
+from imfvla.recording import Recordings
 from imfvla.run_directory import DONE, FAILED, RunDirectory
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.logger import read_metrics
@@ -32,7 +33,7 @@ def calls(synthetic_demonstrations, monkeypatch):
 
     def collect(config):
         seen.append(("collect",))
-        return synthetic_demonstrations
+        return Recordings.of(synthetic_demonstrations)
 
     def evaluate(run, **options):
         seen.append(("evaluate", options))

@@ -224,7 +224,7 @@ def test_an_attachment_is_read_and_never_written(fuzz, tmp_path):
     write_episode(tmp_path / "a.mcap", 0, num_steps=3, views=("front",), image_size=(16, 16))
     renamed = (tmp_path / "a.mcap").read_bytes().replace(b"config.json", b"../../a.txt")
     (tmp_path / "a.mcap").write_bytes(renamed)
-    with pytest.raises(UserError, match=r"a\.mcap is truncated or corrupt"):
+    with pytest.raises(UserError, match=r"a\.mcap is damaged"):
         read_episode(tmp_path / "a.mcap")  # its checksum is of the old name
     assert [path.name for path in tmp_path.rglob("*")] == ["a.mcap"]
     assert McapSink(tmp_path / "b.mcap").path.parent == tmp_path

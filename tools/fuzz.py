@@ -42,7 +42,7 @@ from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
 from imfvla.files import write_json
 from imfvla.nn.pretrained import read_weights
-from imfvla.recording import read_episode, read_index
+from imfvla.recording import Recordings, read_episode, read_index
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.mapping import read_mapping
@@ -271,9 +271,8 @@ def make_targets(folder: Path) -> dict[str, Target]:
     weights = {"actions": [[1.0], [0.5, 0.5]], "context": []}
     write_json(depth, {"experiment": "x", "checkpoint_step": 3, **weights})
     store = folder / "store"
-    FrameStore.build(
-        write_demonstrations(folder / "demos", num_episodes=2, num_steps=4), store, (16, 16), ("front",)
-    )
+    demos = write_demonstrations(folder / "demos", num_episodes=2, num_steps=4)
+    FrameStore.build(Recordings.of(demos), store, (16, 16), ("front",))
     tables = folder / "tables.yaml"
     tables.write_bytes((ROOT / "experiments" / "tables.yaml").read_bytes())
 

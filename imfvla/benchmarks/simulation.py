@@ -9,6 +9,7 @@ import numpy as np
 from imfvla import tasks
 from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.collection import collect
+from imfvla.recording import Recordings
 
 MEASURE_S = 1.0  # seconds of each rate
 FRAMES = 50  # rendered per view
@@ -28,15 +29,15 @@ def measure_simulation(env: Any) -> dict[str, float]:
     }
 
 
-def measure_demonstrations(config: Mapping[str, Any], directory: Path) -> tuple[dict[str, float], Path]:
+def measure_demonstrations(config: Mapping[str, Any], directory: Path) -> tuple[dict[str, float], Recordings]:
     """Records three demonstrations below `directory`, as `imfvla.collect` would, and times the last two.
 
-    Returns the rate of one process [1/min] and the folder of the recordings.
+    Returns the rate of one process [1/min] and the recordings.
     """
     demos = {**config["demos"], "directory": str(directory), "workers": 0, "episodes": 1}
     collect(config["task"], config["observation"], demos)
     report = collect(config["task"], config["observation"], {**demos, "episodes": 3})
-    return {"demonstrations_per_min": 60 * report.num_new / report.wall_s}, report.directory
+    return {"demonstrations_per_min": 60 * report.num_new / report.wall_s}, report.recordings
 
 
 def make_environment(config: Mapping[str, Any]) -> Any:

@@ -14,6 +14,7 @@ from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
 from imfvla.policy import Policy
+from imfvla.recording import Recordings
 from imfvla.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
@@ -25,7 +26,7 @@ GEMM = 2048  # rows and columns of the matrices that the peak is measured with
 
 
 def measure_training(
-    config: Mapping[str, Any], policy: Policy, demonstrations: Path, scratch: Path, steps: int
+    config: Mapping[str, Any], policy: Policy, demonstrations: Recordings, scratch: Path, steps: int
 ) -> dict[str, Any]:
     """Trains `policy` for a few steps on recorded demonstrations, as `imfvla.train` would, and takes times.
 

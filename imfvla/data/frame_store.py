@@ -5,6 +5,7 @@ Shapes: N frames, V views, H W pixels, T control steps of all episodes, S state,
 
 import hashlib
 import json
+import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -18,11 +19,12 @@ import numpy as np
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.files import locked
-from imfvla.recording import Episode, read_episode, read_index
+from imfvla.files import locked, write_remedy
+from imfvla.recording import Episode, Recordings, read_episode, read_index
 
 FORMAT = 1
 IMAGES = "images.raw"
+FILES = {IMAGES, "image_steps.npy", "state.npy", "action.npy", "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, pictures and checksums run outside the interpreter lock
 
 Progress = Callable[[int, int], None]  # told of (episodes done, episodes in all)
@@ -83,36 +85,30 @@ class FrameStore:
     @classmethod
     def build(
         cls,
-        directory: str | Path,
+        recordings: Recordings,
         store_path: str | Path,
         image_size: Sequence[int],
         views: Sequence[str],
         *,
         progress: Progress | None = None,
     ) -> "FrameStore":
-        """The store of all `*.mcap` of `directory`; one that is there already is kept while it is up to date.
+        """The store of these recordings; one that is there already is kept while it is up to date.
 
         It is out of date once files, views or image size are others. Episodes are decoded a few at a time,
         so memory stays low; frames of another size are resampled. Raises UserError where recordings are
-        missing, damaged or without a view, and where the disk is full; a store that was there is replaced
-        by a complete one only. Concurrent builds wait for each other.
+        missing, damaged or without a view, where nothing can be written, and where something else is at
+        `store_path`; a store that was there is replaced by a complete one only. Concurrent builds wait for
+        each other.
         """
-        directory, store_path = Path(directory), Path(store_path)
-        files = sorted(directory.glob("*.mcap"))
-        if not files:
-            raise UserError(
-                f"No recordings (*.mcap) in {directory}: collect demonstrations with "
-                "`python -m imfvla.collect`, or correct the directory."
-            )
-        source = _source(files, tuple(views), tuple(image_size))
-        store_path.parent.mkdir(parents=True, exist_ok=True)
+        store_path = Path(store_path)
+        source = _source(recordings.files, tuple(views), tuple(image_size))
         with locked(store_path):
             if not _is_current(store_path, source):
-                _write(files, store_path, source, progress or (lambda done, total: None))
-        return cls.open(store_path)
+                _write(recordings.files, store_path, source, progress or (lambda done, total: None))
+            return cls.open(store_path)
 
 
-def _source(files: list[Path], views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
+def _source(files: Sequence[Path], views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
     """What a store is made of: its digest tells whether it is up to date."""
     digest = hashlib.sha256(json.dumps([FORMAT, views, image_size]).encode())
     num_frames = 0
@@ -141,32 +137,39 @@ def _is_current(store_path: Path, source: dict[str, Any]) -> bool:
         return False
 
 
-def _write(files: list[Path], store_path: Path, source: dict[str, Any], progress: Progress) -> None:
+def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], progress: Progress) -> None:
     """Writes a complete store beside `store_path` and moves it there."""
+    if store_path.exists() and not (store_path.is_dir() and set(os.listdir(store_path)) <= FILES):
+        raise UserError(
+            f"{store_path} is where decoded frames go, but is no frame store: move it away, or choose another "
+            "folder with demos.frames_directory."
+        )
     part = store_path.with_name(f".{store_path.name}.part")
     height, width = source["image_size"]
     needed = source["num_frames"] * len(source["views"]) * 3 * height * width
-    shutil.rmtree(part, ignore_errors=True)
-    if (free := shutil.disk_usage(store_path.parent).free) < needed:
-        raise UserError(
-            f"Frame store {store_path} needs {needed / 1e9:.1f} GB, found {free / 1e9:.1f} GB free: "
-            "free disk space, or lower observation.image_size or the number of views."
-        )
     try:
+        store_path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
+        if (free := shutil.disk_usage(part).free) < needed:
+            raise UserError(
+                f"Frame store {store_path} needs {needed / 1e9:.1f} GB, found {free / 1e9:.1f} GB free: free disk "
+                "space, choose another disk with demos.frames_directory, or lower observation.image_size or the "
+                "number of views."
+            )
         _write_arrays(files, part, source, progress)
         shutil.rmtree(store_path, ignore_errors=True)
         part.rename(store_path)
     except OSError as error:
-        reason = error.strerror or error
         raise UserError(
-            f"Cannot write frame store {store_path}: {reason}. Free disk space and run again."
+            f"Cannot write frame store {store_path}: {error.strerror or error}; choose another folder with "
+            f"demos.frames_directory, or {write_remedy(error)}."
         ) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_arrays(files: list[Path], part: Path, source: dict[str, Any], progress: Progress) -> None:
+def _write_arrays(files: Sequence[Path], part: Path, source: dict[str, Any], progress: Progress) -> None:
     entries, steps, states, actions = [], [], [], []
     with open(part / IMAGES, "wb") as stream:
         for episode, frames in _decoded(files, source["views"], source["image_size"]):
@@ -199,7 +202,7 @@ def _load(path: Path) -> np.ndarray:
 
 
 def _decoded(
-    files: list[Path], views: Sequence[str], image_size: Sequence[int]
+    files: Sequence[Path], views: Sequence[str], image_size: Sequence[int]
 ) -> Iterator[tuple[Episode, np.ndarray]]:
     """Episodes in order with their frames, decoded by threads that stay a few episodes ahead."""
     ahead: deque[Future[tuple[Episode, np.ndarray]]] = deque()
@@ -216,7 +219,7 @@ def _decode(file: Path, views: Sequence[str], image_size: Sequence[int]) -> tupl
     """The episode and its frames: contiguous uint8 (K, V, 3, H, W)."""
     episode = read_episode(file, images=views)
     if not (np.isfinite(episode.state).all() and np.isfinite(episode.action).all()):
-        raise UserError(f"Recording {file} has a state or an action that is not finite: delete it.")
+        raise UserError(f"Recording {file} has a state or an action that is not finite: move it away.")
     height, width = image_size
     frames = np.empty((len(episode.image_steps), len(views), 3, height, width), np.uint8)
     for number, view in enumerate(views):

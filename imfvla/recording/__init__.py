@@ -1,12 +1,9 @@
 """Episodes as MCAP files that Foxglove opens as they are, and as videos."""
 
-from imfvla.recording.mcap_reader import (
-    Episode,
-    EpisodeIndex,
-    episode_is_complete,
-    read_episode,
-    read_index,
-)
+from imfvla.recording.folder import Recordings
+from imfvla.recording.mcap_file import TruncatedRecording
+from imfvla.recording.mcap_index import EpisodeIndex, read_index
+from imfvla.recording.mcap_reader import Episode, read_episode
 from imfvla.recording.mcap_sink import McapSink
 from imfvla.recording.video import VideoSink, write_mp4
 
@@ -14,8 +11,9 @@ __all__ = [
     "Episode",
     "EpisodeIndex",
     "McapSink",
+    "Recordings",
+    "TruncatedRecording",
     "VideoSink",
-    "episode_is_complete",
     "read_episode",
     "read_index",
     "write_mp4",

@@ -1,29 +1,20 @@
 """Reads recorded episodes back, and refuses those that are not whole."""
 
-import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zstandard
-from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Attachment, Channel, Message, Metadata
 
 from imfvla.documents import parse_json
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.recording import messages
+from imfvla.recording.mcap_file import MAX_EPISODE_BYTES, clear_read_errors, records
 from imfvla.recording.pictures import decode
-
-_DATA_END = struct.Struct("<BQI")  # record before the summary: opcode, length, CRC of everything before it
-_DATA_END_OPCODE = 0x0F
-MAX_CHUNK_BYTES = 256 * 2**20  # of one chunk, unpacked; ours have 1 MiB
-MAX_EPISODE_BYTES = 2 * 2**30  # of all chunks, and of all decoded pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +35,6 @@ class Episode:
     images: Mapping[str, np.ndarray]  # view -> uint8 (K, H, W, 3); empty if not asked for
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeIndex:
-    """What the end of a recording says about it, without reading the rest."""
-
-    num_bytes: int
-    num_steps: int
-    num_frames: Mapping[str, int]  # view -> number of frames
-    data_crc: int  # CRC-32 of everything recorded
-
-
 def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> Episode:
     """The whole episode at `path`, with every checksum verified.
 
@@ -61,52 +42,8 @@ def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> 
     it is missing, truncated or corrupt, and where it lacks a view that is asked for.
     """
     path = Path(path)
-    data = _read_bytes(path)
-    try:
-        return _parse(path, data, images)
-    except UserError:
-        raise
-    except Exception as error:  # a damaged byte can surface as anything from EndOfFile to KeyError
-        raise _damaged(path, error) from error
-
-
-def read_index(path: str | Path) -> EpisodeIndex:
-    """The counts at the end of a recording. Raises UserError where the file is missing or incomplete."""
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            summary = SeekingReader(stream, record_size_limit=path.stat().st_size).get_summary()
-            records = {record.name for record in summary.metadata_indexes}
-            if not {messages.EPISODE_RECORD, messages.RESULT_RECORD} <= records:
-                raise ValueError("its first or last record is missing")
-            counts = {
-                summary.channels[channel].topic: count
-                for channel, count in summary.statistics.channel_message_counts.items()
-            }
-            num_bytes = stream.seek(0, 2)
-            footer_length = 1 + 8 + 8 + 8 + 4 + 8  # opcode, length, two offsets, CRC, closing magic
-            stream.seek(num_bytes - footer_length + 9)
-            summary_start = struct.unpack("<Q", stream.read(8))[0]
-            stream.seek(summary_start - _DATA_END.size)
-            opcode, _, data_crc = _DATA_END.unpack(stream.read(_DATA_END.size))
-            if opcode != _DATA_END_OPCODE:
-                raise ValueError("the record before its summary is none of ours")
-    except FileNotFoundError as error:
-        raise _missing(path) from error
-    except Exception as error:  # see read_episode
-        raise _damaged(path, error) from error
-    cameras = {topic: count for topic, count in counts.items() if topic.startswith(messages.CAMERA)}
-    frames = {topic.removeprefix(messages.CAMERA): count for topic, count in cameras.items()}
-    return EpisodeIndex(num_bytes, counts.get(messages.STATE, 0), frames, data_crc)
-
-
-def episode_is_complete(path: str | Path) -> bool:
-    """Whether `path` was written to its end. Cheap: checksums are left to `read_episode`."""
-    try:
-        read_index(path)
-    except UserError:
-        return False
-    return True
+    with clear_read_errors(path):
+        return _parse(path, path.read_bytes(), images)
 
 
 def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
@@ -114,7 +51,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
     rows: dict[str, list[tuple[int, bytes]]] = {}
     metadata: dict[str, dict[str, str]] = {}
     config: dict[str, Any] = {}
-    for record in _records(data):
+    for record in records(data):
         if isinstance(record, Message):
             rows.setdefault(topics[record.channel_id], []).append((record.log_time, record.data))
         elif isinstance(record, Channel):
@@ -123,12 +60,13 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment) and record.name == messages.CONFIG_ATTACHMENT:
             config = parse_json(record.data)  # read, never written: its name is no path
-    for name in (messages.EPISODE_RECORD, messages.RESULT_RECORD):
+    for name in messages.RECORDS:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
     if (found := metadata[messages.EPISODE_RECORD]["format"]) != messages.FORMAT:
         raise UserError(
-            f"{path} has recording format {found}, wanted {messages.FORMAT}: delete it and collect it again."
+            f"{path} has recording format {found}, wanted {messages.FORMAT}: read it with the version of imfvla that "
+            "wrote it, or move it away and collect it again."
         )
     info = messages.read_info(metadata[messages.EPISODE_RECORD], config)
     result = messages.read_result(metadata[messages.RESULT_RECORD])
@@ -179,30 +117,6 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
     )
 
 
-def _records(data: bytes) -> Iterator[McapRecord]:
-    """The records of a file, those of chunks unpacked, checksums verified; never more than a chunk in memory.
-
-    Raises ValueError where chunks promise more than an episode can have: a small file can unpack to anything.
-    """
-    reader = StreamReader(BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
-    total = 0
-    for record in reader.records:
-        if not isinstance(record, Chunk):
-            yield record
-            continue
-        if record.compression not in ("", "zstd"):
-            raise ValueError(f"compression {record.compression!r}, wanted zstd or none")
-        size = len(record.data)
-        if record.compression == "zstd":
-            size = zstandard.get_frame_parameters(record.data).content_size
-        total += size
-        if size > MAX_CHUNK_BYTES or total > MAX_EPISODE_BYTES:
-            raise ValueError(f"chunks that unpack to {total} bytes")
-        if size != record.uncompressed_size:
-            raise ValueError(f"a chunk of {size} bytes that is said to have {record.uncompressed_size}")
-        yield from breakup_chunk(record, validate_crc=True)
-
-
 def _decoded(encoded: Iterable[bytes]) -> Iterator[np.ndarray]:
     total = 0
     for message in encoded:
@@ -218,21 +132,3 @@ def _matrix(rows: list) -> np.ndarray:
     with np.errstate(over="ignore"):  # what is too large for a float32 is infinite
         numbers = np.array(rows, np.float64).astype(np.float32)
     return numbers.reshape(len(rows), len(messages.ACTION_NAMES))
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise _missing(path) from error
-
-
-def _missing(path: Path) -> UserError:
-    return UserError(f"Recording {path} does not exist: give the path of a recorded .mcap file.")
-
-
-def _damaged(path: Path, error: Exception) -> UserError:
-    reason = f"{type(error).__name__} {error}".strip()
-    return UserError(
-        f"Recording {path} is truncated or corrupt ({reason}): delete it, then collect or evaluate again."
-    )

@@ -10,6 +10,7 @@ from mcap.writer import CompressionType, Writer
 
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
+from imfvla.files import write_remedy
 from imfvla.recording import messages, schemas
 from imfvla.recording.pictures import encode
 from imfvla.recording.scene import at_time, body_names, frame_transforms, scene_update
@@ -156,8 +157,7 @@ class McapSink:
         except OSError as error:
             self.abort()
             raise UserError(
-                f"Cannot record {self.path}: {error.strerror or error}. "
-                "Free disk space or choose another directory, and run the command again."
+                f"Cannot record {self.path}: {error.strerror or error}; {write_remedy(error)}."
             ) from error
         except BaseException:
             self.abort()

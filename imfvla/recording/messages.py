@@ -21,6 +21,7 @@ FORMAT = "1"
 EPOCH_NS = 1_767_225_600 * 10**9  # 2026-01-01T00:00:00Z
 EPISODE_RECORD = "imfvla.episode"  # metadata: EpisodeInfo, written first
 RESULT_RECORD = "imfvla.result"  # metadata: EpisodeResult, written last: a file without it is incomplete
+RECORDS = (EPISODE_RECORD, RESULT_RECORD)
 CONFIG_ATTACHMENT = "config.json"
 
 CAMERA = "/camera/"

@@ -12,6 +12,7 @@ import numpy as np
 
 from imfvla.episode import CONTROL_HZ, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
+from imfvla.files import write_remedy
 
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -77,10 +78,7 @@ class Mp4Writer:
         self._stream.codec_context.flags |= av.codec.context.Flags.bitexact
 
     def _unwritable(self, error: OSError) -> UserError:
-        return UserError(
-            f"Cannot write video {self.path}: {error.strerror or error}. Free disk space or choose another "
-            "directory, and run the command again."
-        )
+        return UserError(f"Cannot write video {self.path}: {error.strerror or error}; {write_remedy(error)}.")
 
 
 def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:

@@ -13,10 +13,12 @@ from dm_env import specs
 
 from imfvla.episode import ACTION_DIM, ACTION_NAMES, CONTROL_HZ, STATE_DIM
 from imfvla.errors import UserError
+from imfvla.options import build
 from imfvla.tasks.props import Prop
 from imfvla.tasks.robot import FINGER_TRAVEL, home_joints
 from imfvla.tasks.scene import CAMERAS, PHYSICS_TIMESTEP_S, Scene
 from imfvla.tasks.texts import text_for
+from imfvla.views import ViewOptions
 
 TIME_LIMIT_STEPS = 700
 START_OPENING = 0.8
@@ -213,8 +215,8 @@ class BimanualEnvironment(composer.Environment):
         self, task: BimanualTask, *, seed: int | None, image_size: tuple[int, int], views: tuple[str, ...]
     ) -> None:
         _check_views(views)
-        self.views = tuple(views)
-        self.image_size = tuple(image_size)
+        seen = build(ViewOptions, {"views": views, "image_size": image_size}, "observation")
+        self.views, self.image_size = seen.views, seen.image_size
         self._seeds = np.random.RandomState(seed)
         self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
         self._start_digest = ""

@@ -4,6 +4,7 @@ import numpy as np
 from dm_control import composer, mjcf
 
 from imfvla.tasks.robot import TABLE_BIT, Arm, look_at
+from imfvla.views import LARGEST
 
 PHYSICS_TIMESTEP_S = 0.004
 BASE_X = 0.62  # the arms' bases stand at -x (left) and +x (right) and face each other
@@ -67,8 +68,8 @@ class Scene(composer.Arena):
         root.visual.quality.numslices = 12
         root.visual.quality.numstacks = 8
         root.visual.quality.numquads = 4
-        getattr(root.visual, "global").offwidth = 1280
-        getattr(root.visual, "global").offheight = 960
+        getattr(root.visual, "global").offwidth = LARGEST[1]
+        getattr(root.visual, "global").offheight = LARGEST[0]
         root.visual.map.znear = 0.01
         root.visual.headlight.ambient = [0.45, 0.45, 0.45]
         root.visual.headlight.diffuse = [0.15, 0.15, 0.15]

@@ -8,13 +8,18 @@ from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Wind
 from imfvla.horizon import Horizon
 from imfvla.options import build
 from imfvla.progress import Progress
+from imfvla.recording import Recordings
 
 
-def prepare_windows(config: Mapping[str, Any], demonstrations: Path) -> Windows:
-    """The training items of a folder of recordings, whose frame store beside it is built if out of date."""
+def prepare_windows(config: Mapping[str, Any], demonstrations: Recordings) -> Windows:
+    """The training items of recordings, whose frame store is built if out of date.
+
+    It lies in `demos.frames_directory`, or beside the folder of the recordings where that is null.
+    """
     observation = config["observation"]
     height, width = observation["image_size"]
-    store_path = demonstrations.with_name(f"{demonstrations.name}_frames_{height}x{width}")
+    directory = config["demos"]["frames_directory"] or demonstrations.directory.parent
+    store_path = Path(directory) / f"{demonstrations.name}_frames_{height}x{width}"
     with _DecodingProgress() as progress:
         store = FrameStore.build(
             demonstrations, store_path, observation["image_size"], observation["views"], progress=progress

@@ -11,11 +11,12 @@ from synthetic import VIEWS
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
+from imfvla.recording import Recordings
 
 
 @pytest.fixture
 def windows(synthetic_demonstrations, tmp_path) -> Windows:
-    store = FrameStore.build(synthetic_demonstrations, tmp_path / "store", (32, 32), VIEWS)
+    store = FrameStore.build(Recordings.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
     return Windows(store, Horizon(1, 8, 4))
 
 

@@ -9,6 +9,7 @@ from imfvla.data import FrameStore, Statistics, Windows
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
+from imfvla.recording import Recordings
 
 NUM_STEPS = 21
 NUM_EPISODES = 2
@@ -17,7 +18,7 @@ NUM_EPISODES = 2
 def build(directory, camera_every: int) -> FrameStore:
     options = {"num_steps": NUM_STEPS, "image_size": (8, 8), "camera_every": camera_every}
     write_demonstrations(directory / "demonstrations", num_episodes=NUM_EPISODES, **options)
-    return FrameStore.build(directory / "demonstrations", directory / "store", (8, 8), VIEWS)
+    return FrameStore.build(Recordings.of(directory / "demonstrations"), directory / "store", (8, 8), VIEWS)
 
 
 @pytest.fixture(scope="module")

@@ -76,11 +76,12 @@ def composed_parts(job: Job) -> tuple[Any, ...]:
     from imfvla.composition import compose  # here: the tiny policy starts sooner without
     from imfvla.options import build
     from imfvla.policy import build_policy
+    from imfvla.recording import Recordings
     from imfvla.training.data import make_loader, prepare_windows
     from imfvla.training.options import OptimOptions, TrainingOptions
 
     config = compose("train", job.overrides)
-    windows = prepare_windows(config, Path(job.demos))
+    windows = prepare_windows(config, Recordings.of(job.demos))
     torch.manual_seed(0)
     return (
         build_policy(config, windows.statistics()),

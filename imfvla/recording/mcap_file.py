@@ -1,0 +1,126 @@
+"""The records of an MCAP file, whichever library wrote it, and whether a file is cut off."""
+
+import errno
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import lz4.frame
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Chunk, McapRecord
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from imfvla.errors import UserError
+
+MAGIC = b"\x89MCAP0\r\n"  # at both ends of a file
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+FOOTER_SIZE = RECORD_HEAD.size + 8 + 8 + 4  # two offsets and a CRC
+DATA_END_SIZE = RECORD_HEAD.size + 4  # a CRC
+MAX_CHUNK_BYTES = 256 * 2**20  # of one chunk, unpacked; ours have 1 MiB
+MAX_EPISODE_BYTES = 2 * 2**30  # of all chunks, and of all decoded pictures
+
+
+class TruncatedRecording(UserError):
+    """A recording that ends before its end."""
+
+
+def records(data: bytes) -> Iterator[McapRecord]:
+    """The records of a file, those of chunks unpacked, checksums verified; never more than a chunk in memory.
+
+    Raises ValueError where chunks promise more than an episode can have: a small file can unpack to anything.
+    """
+    reader = StreamReader(BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
+    total = 0
+    for record in reader.records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        total += record.uncompressed_size
+        if record.uncompressed_size > MAX_CHUNK_BYTES or total > MAX_EPISODE_BYTES:
+            raise ValueError(f"chunks that unpack to {total} bytes")
+        yield from breakup_chunk(replace(record, compression="", data=_unpacked(record)), validate_crc=True)
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """The content of a chunk, which must have the size that its record states: a frame need not say its own."""
+    most = chunk.uncompressed_size + 1  # one more than stated tells a longer content
+    if chunk.compression == "zstd":
+        content = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True).read(most)
+    elif chunk.compression == "lz4":
+        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
+    elif chunk.compression == "":
+        content = chunk.data
+    else:
+        raise ValueError(f"compression {chunk.compression!r}, wanted zstd, lz4 or none")
+    if len(content) != chunk.uncompressed_size:
+        found = f"{len(content)}" if len(content) < most else "more"
+        raise ValueError(f"a chunk of {found} bytes that is said to have {chunk.uncompressed_size}")
+    return content
+
+
+def missing_end(path: Path) -> str | None:
+    """What a file that is cut off lacks: "data end" or "footer". None where it ends as MCAP files do, or is none.
+
+    Lengths are followed, contents left unread, so a damaged file is not taken for one that is cut off.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        start = stream.read(len(MAGIC))
+        if not MAGIC.startswith(start):
+            return None
+        if size >= 2 * len(MAGIC):
+            stream.seek(-len(MAGIC), 2)
+            if stream.read() == MAGIC:
+                return None
+        place = len(MAGIC)
+        while place + RECORD_HEAD.size <= size:
+            stream.seek(place)
+            opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
+            if opcode == 0:  # no record has it: zeros that a file system left
+                return None
+            place += RECORD_HEAD.size + length
+            if opcode == Opcode.DATA_END and place <= size:
+                return "footer"
+    return "data end"
+
+
+@contextmanager
+def clear_read_errors(path: Path) -> Iterator[None]:
+    """Turns what goes wrong with a recording into a UserError that says what was found.
+
+    Only where its data is truly cut off is deleting it advised.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError as error:
+        raise UserError(
+            f"Recording {path} does not exist: give the path of a recorded .mcap file."
+        ) from error
+    except Exception as error:  # a damaged byte can surface as anything from EndOfFile to KeyError
+        # A damaged offset is an invalid argument.
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:
+            reason = error.strerror or error
+            raise UserError(
+                f"Recording {path} cannot be read: {reason}; check the path and its rights."
+            ) from error
+        if (missing := missing_end(path)) == "data end":
+            raise TruncatedRecording(
+                f"Recording {path} is truncated (its data end record is missing): delete it, "
+                "then collect or evaluate again."
+            ) from error
+        if missing:
+            raise TruncatedRecording(
+                f"Recording {path} is truncated after its data, which may be whole: copy it again, or let "
+                "`mcap recover` write it again."
+            ) from error
+        reason = f"{type(error).__name__} {error}".strip()
+        raise UserError(
+            f"Recording {path} is damaged or no episode of imfvla ({reason}): restore it from a copy, or move it "
+            "away and collect or evaluate again."
+        ) from error
