@@ -8,7 +8,7 @@ from imfvla import collection
 from imfvla.collection import collect
 from imfvla.composition import compose
 from imfvla.errors import UserError
-from imfvla.recording import episode_is_complete, read_episode
+from imfvla.recording import read_episode
 
 TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002, "hold": 18}}
 OBSERVATION = {"views": ["front", "r_wrist"], "image_size": [24, 32]}
@@ -39,8 +39,17 @@ def played(monkeypatch):
         return seed, True
 
     monkeypatch.setattr(collection, "record_demonstration", record)
-    monkeypatch.setattr(collection, "episode_is_complete", lambda path: path.read_bytes() == b"episode")
+    monkeypatch.setattr(collection, "_is_recorded", lambda directory, seed, settings: True)
     return seeds
+
+
+def folder(report: collection.Report) -> Path:
+    return report.recordings.directory
+
+
+def contents(report: collection.Report) -> dict[Path, int]:
+    """The recordings and when they were written."""
+    return {path: path.stat().st_mtime_ns for path in folder(report).glob("*.mcap")}
 
 
 def files(directory: Path) -> list[str]:
@@ -48,11 +57,11 @@ def files(directory: Path) -> list[str]:
 
 
 def test_demonstrations_are_complete_recordings_of_successes(recorded):
-    assert (recorded.num_episodes, recorded.num_new, recorded.num_failed) == (2, 2, 0)
-    assert recorded.directory.name == "transfer-easy-modes2-24x32"
-    assert files(recorded.directory) == ["episode-000000.mcap", "episode-000001.mcap"]
-    for seed, path in enumerate(sorted(recorded.directory.glob("*.mcap"))):
-        assert episode_is_complete(path)
+    assert (recorded.num_new, recorded.num_failed) == (2, 0)
+    assert recorded.recordings.name == folder(recorded).name == "transfer-easy-modes2-24x32"
+    assert files(folder(recorded)) == ["episode-000000.mcap", "episode-000001.mcap"]
+    assert recorded.recordings.files == tuple(sorted(folder(recorded).glob("*.mcap")))
+    for seed, path in enumerate(recorded.recordings.files):
         episode = read_episode(path)
         assert (episode.info.kind, episode.info.task, episode.info.seed) == (
             "demonstration",
@@ -69,46 +78,91 @@ def test_demonstrations_are_complete_recordings_of_successes(recorded):
 
 
 def test_what_is_there_is_kept(recorded):
-    before = {path: path.stat().st_mtime_ns for path in recorded.directory.glob("*.mcap")}
-    again = collect(TASK, OBSERVATION, demos(recorded.directory.parent))
-    assert (again.directory, again.num_new) == (recorded.directory, 0)
-    assert {path: path.stat().st_mtime_ns for path in recorded.directory.glob("*.mcap")} == before
+    before = contents(recorded)
+    again = collect(TASK, OBSERVATION, demos(folder(recorded).parent))
+    assert (again.recordings, again.num_new) == (recorded.recordings, 0)
+    assert contents(recorded) == before
 
 
 def test_a_truncated_recording_is_made_again(recorded):
-    path = recorded.directory / "episode-000001.mcap"
+    path = recorded.recordings.files[1]
     whole = path.read_bytes()
     actions = read_episode(path, images=False).action
     path.write_bytes(whole[: len(whole) // 2])
-    again = collect(TASK, OBSERVATION, demos(recorded.directory.parent))
+    again = collect(TASK, OBSERVATION, demos(folder(recorded).parent))
     assert again.num_new == 1
     np.testing.assert_array_equal(read_episode(path, images=False).action, actions)
 
 
-def test_fewer_than_there_are_come_as_links(recorded):
-    fewer = collect(TASK, OBSERVATION, demos(recorded.directory.parent, episodes=1))
-    assert fewer.directory != recorded.directory
-    assert files(fewer.directory) == ["episode-000000.mcap"]
-    assert episode_is_complete(fewer.directory / "episode-000000.mcap")
+def test_a_file_that_may_be_whole_is_not_recorded_over(recorded):
+    path = recorded.recordings.files[1]
+    whole = path.read_bytes()
+    for strange in (path.with_name("episode-000000.mcap").read_bytes(), b"PK\3\4" + whole):
+        path.write_bytes(strange)
+        with pytest.raises(UserError, match=r"episode-000001\.mcap .*move it away"):
+            collect(TASK, OBSERVATION, demos(folder(recorded).parent))
+        assert path.read_bytes() == strange
+    path.write_bytes(whole)
+
+
+def test_fewer_than_there_are_are_chosen_without_writing_anything(recorded):
+    before = contents(recorded)
+    fewer = collect(TASK, OBSERVATION, demos(folder(recorded).parent, episodes=1)).recordings
+    assert fewer.files == recorded.recordings.files[:1]
+    assert fewer.name != recorded.recordings.name
+    assert contents(recorded) == before
+    assert [path.name for path in folder(recorded).parent.iterdir() if path.is_dir()] == [
+        folder(recorded).name
+    ]
+
+
+def test_files_beside_the_demonstrations_are_named_and_not_used(recorded, caplog):
+    first = recorded.recordings.files[0]
+    strays = [first.with_name(name) for name in ("episode-000000 (1).mcap", "episode-3.mcap", "mine.mcap")]
+    for stray in strays:
+        stray.write_bytes(first.read_bytes())
+    again = collect(TASK, OBSERVATION, demos(folder(recorded).parent))
+    assert (again.recordings, again.num_new) == (recorded.recordings, 0)
+    for stray in strays:
+        assert repr(stray.name) in caplog.text
+        assert stray.exists()
+        stray.unlink()
 
 
 def test_a_folder_of_other_settings_is_refused_and_kept(recorded):
-    before = files(recorded.directory)
+    before = files(folder(recorded))
     for task, observation in (
         ({**TASK, "expert": {"modes": 2, "noise": 0.01, "hold": 18}}, OBSERVATION),
         (TASK, {**OBSERVATION, "views": ["front"]}),
     ):
         with pytest.raises(UserError, match=r"was recorded with (noise|views)=.* is wanted; choose another"):
-            collect(task, observation, demos(recorded.directory.parent))
-    assert files(recorded.directory) == before
+            collect(task, observation, demos(folder(recorded).parent))
+    assert files(folder(recorded)) == before
+
+
+def test_a_folder_without_its_log_is_refused(recorded):
+    log = folder(recorded) / "collection.json"
+    text = log.read_text()
+    log.unlink()
+    with pytest.raises(UserError, match=r"holds recordings, but no collection\.json .* restore it"):
+        collect(TASK, OBSERVATION, demos(folder(recorded).parent))
+    log.write_text(text)
+
+
+def test_a_folder_without_recordings_takes_other_settings(played, tmp_path):
+    for path in collect(TASK, OBSERVATION, demos(tmp_path, camera_every=4)).recordings.files:
+        path.unlink()
+    assert collect(TASK, OBSERVATION, demos(tmp_path)).num_new == 2
 
 
 def test_failures_are_counted_left_out_and_not_tried_again(played, tmp_path):
     report = collect(TASK, OBSERVATION, demos(tmp_path, episodes=5))
     assert played == [0, 1, 2, 3, 4, 5, 6]
-    assert (report.num_episodes, report.num_new, report.num_failed) == (5, 5, 2)
-    assert files(report.directory) == [f"episode-{seed:06d}.mcap" for seed in (0, 2, 3, 5, 6)]
-    assert json.loads((report.directory / "collection.json").read_text())["failed_seeds"] == [1, 4]
+    assert (report.num_new, report.num_failed) == (5, 2)
+    assert [path.name for path in report.recordings.files] == [
+        f"episode-{seed:06d}.mcap" for seed in (0, 2, 3, 5, 6)
+    ]
+    assert json.loads((folder(report) / "collection.json").read_text())["failed_seeds"] == [1, 4]
     played.clear()
     report = collect(TASK, OBSERVATION, demos(tmp_path, episodes=6))
     assert played == [7]
@@ -118,12 +172,12 @@ def test_failures_are_counted_left_out_and_not_tried_again(played, tmp_path):
 def test_the_seeds_used_do_not_depend_on_interruptions(played, tmp_path):
     for episodes in (1, 3):
         collect(TASK, OBSERVATION, demos(tmp_path, episodes=episodes))
-    whole = collect(TASK, OBSERVATION, demos(tmp_path, episodes=5)).directory
+    whole = folder(collect(TASK, OBSERVATION, demos(tmp_path, episodes=5)))
     assert files(whole) == [f"episode-{seed:06d}.mcap" for seed in (0, 2, 3, 5, 6)]
 
 
 def test_the_seeds_of_the_band_can_run_out(played, tmp_path):
-    with pytest.raises(UserError, match=r"demos.episodes=3 cannot be had: .* end at 9999"):
+    with pytest.raises(UserError, match=r"demos.episodes=3 cannot be collected: .* end at 9999"):
         collect(TASK, OBSERVATION, demos(tmp_path, episodes=3, first_seed=9998))
 
 
@@ -135,10 +189,30 @@ def test_mistakes_are_named(key, value, tmp_path):
         collect(TASK, OBSERVATION, demos(tmp_path, **{key: value}))
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("views", []),
+        ("views", ["front", "front"]),
+        ("views", ["front", "side"]),
+        ("views", "front"),
+        ("image_size", [0, 32]),
+        ("image_size", [32, -1]),
+        ("image_size", [8, 8000]),
+        ("image_size", [961, 8]),
+        ("image_size", [32]),
+    ],
+)
+def test_pictures_that_cannot_be_are_named_before_anything_is_written(key, value, tmp_path):
+    with pytest.raises(UserError, match=f"observation.{key}"):
+        collect(TASK, {**OBSERVATION, key: value}, demos(tmp_path / "demos"))
+    assert not list(tmp_path.rglob("*.json"))
+
+
 def test_a_damaged_log_is_named(played, tmp_path):
-    directory = collect(TASK, OBSERVATION, demos(tmp_path)).directory
+    directory = folder(collect(TASK, OBSERVATION, demos(tmp_path)))
     (directory / "collection.json").write_text("{")
-    with pytest.raises(UserError, match=r"collection.json is damaged .* remove .* to record it anew"):
+    with pytest.raises(UserError, match=r"collection.json is damaged .* move .* away to record it again"):
         collect(TASK, OBSERVATION, demos(tmp_path))
 
 
