@@ -1,7 +1,10 @@
 """Turns recorded episodes into mp4 videos of the frames that they hold, in real time.
 
-python tools/mcap_to_mp4.py episode.mcap                   # writes episode.mp4 beside it
+python tools/mcap_to_mp4.py episode.mcap                   # writes episode.mp4 beside it, unless that exists
 python tools/mcap_to_mp4.py episode.mcap -o film.mp4 --views front top
+
+A frame stays until the next one: a policy that looks once in 16 steps changes the picture about 3 times a second, while
+the time, the stage and the return in the caption go on.
 """
 
 from imfvla.command import as_command, begin
@@ -21,23 +24,37 @@ from imfvla.errors import UserError
 from imfvla.recording import Episode, read_episode, write_mp4
 from imfvla.recording.video import side_by_side
 
+FRAME_STEPS = 2  # control steps between two pictures of a video: 25 a second
 
-def frames(episode: Episode) -> Iterator[np.ndarray]:
-    """Captioned pictures uint8 (H, W, 3), one for each step with frames."""
+
+def frames(episode: Episode, every: int) -> Iterator[np.ndarray]:
+    """Captioned pictures uint8 (H, W, 3) of every `every`-th control step: what was seen last before it or at it."""
     returns = episode.reward.cumsum()
-    for row, step in enumerate(episode.image_steps):
+    for step in range(episode.image_steps[0], len(episode.state), every):
+        row = np.searchsorted(episode.image_steps, step, side="right") - 1
         status = f"{episode.time_s[step]:5.2f} s  stage {episode.stage[step]}  return {returns[step]:.0f}"
         pictures = [episode.images[view][row] for view in episode.images]
         yield side_by_side(pictures, f"{episode.info.task}  seed {episode.info.seed}  {status}")
 
 
 def export(source: Path, target: Path, views: list[str] | None) -> None:
-    """Writes the video of one recording. Raises UserError where it is damaged or has too few frames."""
+    """Writes the video of one recording. Raises UserError where it is damaged or has no frames."""
     episode = read_episode(source, images=views or True)
-    if len(episode.image_steps) < 2:
-        raise UserError(f"{source} holds {len(episode.image_steps)} frames: a video wants at least 2.")
-    steps_per_frame = float(np.diff(episode.image_steps).mean())
-    write_mp4(target, frames(episode), CONTROL_HZ / steps_per_frame)
+    if not len(episode.image_steps):
+        raise UserError(f"{source} holds no frames that all of its views share: there is nothing to show.")
+    # A step that the video passes over would hide its frame.
+    every = FRAME_STEPS if (np.diff(episode.image_steps) % FRAME_STEPS == 0).all() else 1
+    write_mp4(target, frames(episode, every), CONTROL_HZ / every)
+
+
+def check_target(target: Path, overwrite: bool) -> None:
+    """Raises UserError where the video would take the place of something else, such as an evaluation's own video."""
+    if target.suffix != ".mp4":
+        raise UserError(f"The video must be called *.mp4, found {target}.")
+    if target.exists() and not overwrite:
+        raise UserError(
+            f"{target} exists: name another video with --output, or add --overwrite to replace it."
+        )
 
 
 @as_command
@@ -46,11 +63,14 @@ def main() -> int:
     parser.add_argument("recordings", nargs="+", type=Path, help="MCAP files")
     parser.add_argument("-o", "--output", type=Path, help="the video, where there is one recording")
     parser.add_argument("--views", nargs="+", help="the views to show, all by default")
+    parser.add_argument("--overwrite", action="store_true", help="replace videos that are there")
     arguments = parser.parse_args()
     if arguments.output and len(arguments.recordings) > 1:
         parser.error("--output is for one recording")
-    for source in arguments.recordings:
-        target = arguments.output or source.with_suffix(".mp4")
+    targets = [arguments.output or source.with_suffix(".mp4") for source in arguments.recordings]
+    for target in targets:
+        check_target(target, arguments.overwrite)
+    for source, target in zip(arguments.recordings, targets, strict=True):
         export(source, target, arguments.views)
         print(target)
     return 0

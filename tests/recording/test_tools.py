@@ -7,8 +7,11 @@ import sys
 from pathlib import Path
 
 import av
+import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
+from synthetic import write_episode
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -39,6 +42,17 @@ def test_check_names_the_broken_one(synthetic_demonstrations, capsys):
     assert "2 of 3 files ok" in out
 
 
+def test_check_goes_on_after_files_of_others(synthetic_demonstrations, capsys):
+    with (synthetic_demonstrations / "a.mcap").open("wb") as stream:
+        writer = Writer(stream, use_statistics=False)
+        writer.start()
+        writer.finish()
+    (synthetic_demonstrations / "b.mcap").write_text("not one")
+    (synthetic_demonstrations / "c.mcap").mkdir()
+    assert run("mcap_check.py", synthetic_demonstrations) == 1
+    assert "3 of 6 files ok" in capsys.readouterr().out
+
+
 def test_check_of_nothing_fails(tmp_path):
     assert run("mcap_check.py", tmp_path) == 1
 
@@ -49,6 +63,43 @@ def test_export_makes_a_video_of_the_recorded_frames(synthetic_demonstrations):
     with av.open(str(source.with_suffix(".mp4"))) as container:
         assert container.streams.video[0].average_rate == 25
         assert sum(1 for _ in container.decode(video=0)) == 12
+
+
+def test_export_plays_in_real_time_whenever_the_policy_looked(tmp_path):
+    write_episode(tmp_path / "a.mcap", 0, num_steps=40, camera_every=16)
+    assert run("mcap_to_mp4.py", tmp_path / "a.mcap") == 0
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == 25
+        pictures = [frame.to_ndarray(format="rgb24")[:-30] for frame in container.decode(video=0)]
+    assert len(pictures) == 20
+    changes = [
+        step for step in range(1, 20) if np.abs(pictures[step] - pictures[step - 1].astype(int)).max() > 64
+    ]
+    assert changes == [8, 16]
+
+
+@pytest.mark.parametrize("target", ["a.mp4", "film.mp4", "a.mcap"])
+def test_export_overwrites_nothing_unasked(tmp_path, capsys, target):
+    for name in ("a.mcap", "b.mcap"):
+        write_episode(tmp_path / name, 0, num_steps=4)
+    there = tmp_path / target
+    if target != "a.mcap":
+        there.write_bytes(b"the evaluation's own")
+    before = there.read_bytes()
+    if target == "a.mp4":
+        assert run("mcap_to_mp4.py", tmp_path / "b.mcap", tmp_path / "a.mcap") == 2
+        assert not (tmp_path / "b.mp4").exists()
+    else:
+        assert run("mcap_to_mp4.py", tmp_path / "a.mcap", "-o", there) == 2
+    assert target in capsys.readouterr().err
+    assert there.read_bytes() == before
+
+
+def test_export_replaces_a_video_where_asked(synthetic_demonstrations):
+    source = synthetic_demonstrations / "episode-00000.mcap"
+    source.with_suffix(".mp4").write_bytes(b"old")
+    assert run("mcap_to_mp4.py", source, "--overwrite") == 0
+    assert source.with_suffix(".mp4").stat().st_size > 1000
 
 
 def test_export_of_a_broken_recording_says_so(synthetic_demonstrations, capsys):
