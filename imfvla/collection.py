@@ -118,12 +118,14 @@ def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapp
         UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
     """
     options, settings = read_options(task, observation, demos)
+    _stage_for(settings)  # what cannot be simulated is told before anything is written
     began = time.perf_counter()
     height, width = settings.image_size
     name = f"{settings.task}-{settings.variant}-modes{settings.modes}-{height}x{width}"
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may want the same demonstrations
         listed = _Log(directory, settings)
+        _name_others(directory)
         chosen = {seed for seed in _seeds_on_file(directory) if _is_recorded(directory, seed, settings)}
         workers = physical_cores() if options.workers is None else options.workers
         num_new = _record_missing(directory, settings, options, workers, listed, chosen)
@@ -263,20 +265,18 @@ def _path(directory: Path, seed: int) -> Path:
 
 
 def _seeds_on_file(directory: Path) -> list[int]:
-    """The seeds whose recordings are there, and a word on files that are none of them."""
-    seeds, others = [], []
-    for path in sorted(directory.glob("*.mcap")):
-        found = re.fullmatch(r"episode-(\d{6})", path.stem)
-        if found:
-            seeds.append(int(found.group(1)))
-        else:
-            others.append(path.name)
-    if others:
+    found = (re.fullmatch(r"episode-(\d{6})\.mcap", path.name) for path in directory.glob("*.mcap"))
+    return sorted(int(match.group(1)) for match in found if match)
+
+
+def _name_others(directory: Path) -> None:
+    """Says which recordings of the folder are none of its collection."""
+    ours = {_path(directory, seed) for seed in _seeds_on_file(directory)}
+    if others := sorted(path.name for path in directory.glob("*.mcap") if path not in ours):
         log.warning(
             f"{directory} holds files that are no demonstrations of its collection and are not used: "
             f"{', '.join(map(repr, others))}."
         )
-    return seeds
 
 
 def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:

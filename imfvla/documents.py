@@ -30,6 +30,8 @@ def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
         value = parse_json(read_text(path, MAX_JSON_BYTES))
         if mapping and not isinstance(value, dict):
             raise ValueError(f"wanted a mapping, found {type(value).__name__}")
+    except PermissionError as error:  # what may be whole is not to be deleted
+        raise UserError(f"{path} cannot be read: {error.strerror}; check its rights.") from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as JSON: {error}; {remedy}.") from error
     return value

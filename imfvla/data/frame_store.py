@@ -77,7 +77,8 @@ class FrameStore:
                 raise ValueError("its arrays differ in length")
         except Exception as error:  # a damaged byte can surface as anything
             raise UserError(
-                f"Frame store {path} cannot be read ({error}): delete it and run again."
+                f"Frame store {path} cannot be read ({error}): delete it, or choose another folder with "
+                "demos.frames_directory, and run again."
             ) from error
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
         return cls(path, views, image_size, tuple(episodes), images, state, action)

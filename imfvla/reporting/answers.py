@@ -148,14 +148,14 @@ def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
     for one, other in pairwise(found):
         if one.training_seed == other.training_seed:
             raise UserError(
-                f"{row.where} ({row.name}) is answered twice, by {one.folder} and {other.folder}: remove one, or "
-                "name directories=[...] that hold one of them."
+                f"{row.where} ({row.name}) is answered twice, by {one.folder} and {other.folder}: move one "
+                "elsewhere, or name directories=[...] that hold one of them."
             )
         differing = differences(one.config, other.config, ("seed", *EXECUTION_KEYS))
         if differing:
             raise UserError(
                 f"{row.where} ({row.name}) is answered by runs of different configs, {one.run} and {other.run}: "
-                f"{'; '.join(differing)}. Remove one."
+                f"{'; '.join(differing)}. Move one elsewhere."
             )
 
 

@@ -162,6 +162,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
+    except PermissionError as error:  # what may be whole is not said to be damaged
+        raise UserError(f"{path} cannot be read: {error.strerror or error}; check its rights.") from error
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise  # the file is well, the machine is not
@@ -171,7 +173,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _damaged(path: Path, error: Exception) -> UserError:
-    return UserError(f"{path} is cut off or damaged ({error}): restore it, or delete it and train again.")
+    return UserError(f"{path} is cut off or damaged ({error}): restore it, or move it away and train again.")
 
 
 def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
@@ -183,7 +185,7 @@ def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
             raise ValueError(f"wanted {DETAILS}, found {kinds}")
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(
-            f"{path} has a damaged header ({error!r}): restore it, or delete it and train again."
+            f"{path} has a damaged header ({error!r}): restore it, or move it away and train again."
         ) from error
     return details
 
