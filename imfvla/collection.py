@@ -125,13 +125,15 @@ def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapp
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may want the same demonstrations
         listed = _Log(directory, settings)
-        _name_others(directory)
-        chosen = {seed for seed in _seeds_on_file(directory) if _is_recorded(directory, seed, settings)}
+        on_file = _seeds_on_file(directory) - listed.failed
+        _name_others(directory, on_file)
+        usable = {seed for seed in on_file if options.first_seed <= seed < SEED_LIMIT}
+        chosen = {seed for seed in usable if _is_recorded(directory, seed, settings)}
         workers = physical_cores() if options.workers is None else options.workers
         num_new = _record_missing(directory, settings, options, workers, listed, chosen)
-        wanted = sorted(seed for seed in chosen if seed >= options.first_seed)[: options.episodes]
+        wanted = sorted(chosen)[: options.episodes]
         num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in listed.failed)
-        if len(wanted) < len(_seeds_on_file(directory)):
+        if len(wanted) < len(on_file | chosen):
             name = f"{name}-seeds{options.first_seed}-n{options.episodes}"
     names = [_path(directory, seed).name for seed in wanted]
     return Report(Recordings.named(directory, names, name), num_new, num_failed, time.perf_counter() - began)
@@ -264,14 +266,14 @@ def _path(directory: Path, seed: int) -> Path:
     return directory / f"episode-{seed:06d}.mcap"
 
 
-def _seeds_on_file(directory: Path) -> list[int]:
+def _seeds_on_file(directory: Path) -> set[int]:
     found = (re.fullmatch(r"episode-(\d{6})\.mcap", path.name) for path in directory.glob("*.mcap"))
-    return sorted(int(match.group(1)) for match in found if match)
+    return {int(match.group(1)) for match in found if match}
 
 
-def _name_others(directory: Path) -> None:
-    """Says which recordings of the folder are none of its collection."""
-    ours = {_path(directory, seed) for seed in _seeds_on_file(directory)}
+def _name_others(directory: Path, seeds: set[int]) -> None:
+    """Says which recordings of the folder are not those of `seeds`."""
+    ours = {_path(directory, seed) for seed in seeds}
     if others := sorted(path.name for path in directory.glob("*.mcap") if path not in ours):
         log.warning(
             f"{directory} holds files that are no demonstrations of its collection and are not used: "
