@@ -1,4 +1,4 @@
-# Every target works on a fresh clone: what it needs is installed first, once. `make help` lists them.
+# Every target works on a fresh clone: it first installs what it needs, once. `make help` lists the targets.
 
 .DEFAULT_GOAL := help
 SHELL := /bin/bash
@@ -22,7 +22,7 @@ INSTALLED := $(VENV)/.installed
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
 	     /^[a-z-]+:.*## / {printf "  %-21s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
-	@printf '\n  ARGS="..." is handed to the command, PYTHON=python3.12 chooses the interpreter of $(VENV).\n'
+	@printf '\n  ARGS="..." is passed to the command; PYTHON=python3.12 sets the interpreter of $(VENV).\n'
 
 setup: $(INSTALLED)  ## Install into .venv, install a GL library if none renders, check the machine
 	@$(PY) tools/doctor.py --only gl > /dev/null || tools/install_gl.sh
@@ -35,15 +35,15 @@ demos: setup  ## Record the demonstrations of both tasks (ARGS="episodes=200")
 	$(PY) -m imfvla.collect task=socket $(ARGS)
 	$(PY) -m imfvla.collect task=transfer $(ARGS)
 
-eval: setup  ## Roll the shipped policy out, write a video (TASK=socket or transfer, EPISODES=4)
+eval: setup  ## Roll out the shipped policy, write a video (TASK=socket or transfer, EPISODES=4)
 	$(PY) -m imfvla.evaluate run=$(SHIPPED) episodes=$(EPISODES) nfe=1 $(ARGS)
 	@echo "Videos, and MCAP files for Foxglove beside them:"; ls $(SHIPPED)/rollouts/*/*.mp4
 
-# A sweep started again skips what is finished, goes on where it was stopped and lists what failed.
+# Rerun a stopped sweep to resume it: finished jobs are skipped, failed ones are listed.
 sweep-socket:  ## Train and evaluate every row of Table 1 (ARGS="seed=0,1,2")
 sweep-transfer:  ## Train and evaluate every row of Table 2
 sweep-horizon:  ## Vary predicted and executed steps
-sweep-evaluations:  ## Evaluate with 1 to 10 flow evaluations
+sweep-evaluations:  ## Evaluate with 1 to 10 steps per chunk
 sweep-demonstrations:  ## Train on 25 to 200 demonstrations
 sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations: sweep-%: setup
 	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
@@ -54,10 +54,10 @@ campaign: setup  ## Train, evaluate and keep every policy of Tables 1 and 2 and 
 bench: setup  ## Measure sizes, simulation, rendering, training and latency on this machine
 	$(PY) -m imfvla.bench $(ARGS)
 
-tables: setup  ## Make the paper's tables, figures and a page from the run directories
+tables: setup  ## Make the paper's tables and figures and a page from the run directories
 	$(PY) -m imfvla.report $(ARGS)
 
-report: setup  ## The same into experiments/report, with videos and recordings: a folder to send or serve
+report: setup  ## Make them in experiments/report, with videos and recordings: a folder to send or serve
 	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
 gallery: setup  ## Write pictures of every view of both tasks
@@ -80,7 +80,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	  echo "imfvla needs Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); name one: make setup PYTHON=python3.11" >&2; \
 	  exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { \
-	  echo "$(PYTHON) could not make a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
+	  echo "$(PYTHON) could not create a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
 	  exit 1; }
 	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
