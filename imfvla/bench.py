@@ -9,8 +9,10 @@ import json
 import logging
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hydra.core.global_hydra import GlobalHydra
 
@@ -25,34 +27,50 @@ from imfvla.benchmarks.tables import (
 from imfvla.composition import CONFIG_DIRECTORY, compose
 from imfvla.entry import entry_point
 from imfvla.fingerprint import fingerprint
-from imfvla.options import require
+from imfvla.options import at_least, build, one_of, require, some, within
+from imfvla.progress import Progress
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.table import Table, number
 
 PARTS = ("sizes", "simulation", "training", "latency")
 SCALES = ("cpu", "paper")
+MANY = 1_000_000
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class BenchOptions:
+    """conf/bench.yaml."""
+
+    parts: Annotated[tuple[str, ...], some(one_of(*PARTS))]
+    sizes_of: Any
+    experiments: Any
+    at_scale: Annotated[str, one_of(*SCALES)]
+    overrides: tuple[str, ...]
+    nfe: Annotated[tuple[int, ...], some(at_least(1))] | None
+    training_steps: Annotated[int, within(1, MANY)]
+    latency_calls: Annotated[int, within(1, MANY)]
+    latency_warm_up: Annotated[int, within(1, MANY)]
 
 
 @entry_point("bench")
 def main(config: dict[str, Any]) -> None:
     """Prints the tables of the wanted parts, and all figures as one line of JSON, which comes last."""
-    for key in ("training_steps", "latency_calls", "latency_warm_up"):
-        value = config[key]
-        require(isinstance(value, int) and value >= 1, key, "a whole number of at least 1", value)
+    build(BenchOptions, config, "")
     parts = config["parts"]
-    scale = config["at_scale"]
-    require(scale in SCALES, "at_scale", f"one of {', '.join(SCALES)}", scale)
-    require(bool(parts) and set(parts) <= set(PARTS), "parts", f"one or more of {', '.join(PARTS)}", parts)
     GlobalHydra.instance().clear()  # the experiments are composed below
     result: dict[str, Any] = {}
-    if "sizes" in parts:
-        result["sizes"] = sizes(experiments(config["sizes_of"], "sizes_of"), config)
-    if set(parts) != {"sizes"}:
-        result["figures"] = {
-            experiment: measure_and_print(experiment, config)
-            for experiment in experiments(config["experiments"], "experiments")
-        }
+    counted = experiments(config["sizes_of"], "sizes_of") if "sizes" in parts else []
+    measured = experiments(config["experiments"], "experiments") if set(parts) != {"sizes"} else []
+    # Here, so that a wrong name is told before anything is measured.
+    composed = [of_measured(name, config) for name in measured]
+    for experiment in counted:
+        compose("train", [f"+exp={experiment}"])
+    if counted:
+        result["sizes"] = sizes(counted, config)
+    if measured:
+        figures = map(lambda name, of_name: measure_and_print(name, of_name, config), measured, composed)
+        result["figures"] = dict(zip(measured, figures, strict=True))
     if "latency" in parts and not config["overrides"]:
         latencies = {name: figures["latency"] for name, figures in result["figures"].items()}
         result["ratios"] = speed_ratios(read_mapping().comparisons, latencies)
@@ -65,7 +83,8 @@ def experiments(wanted: Any, key: str) -> list[str]:
     """Names of files of conf/exp: those `wanted`, a list, or all of them."""
     if wanted == "all":
         return sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
-    require(isinstance(wanted, list) and bool(wanted), key, "all or a list of experiments", wanted)
+    is_list = isinstance(wanted, list) and bool(wanted) and all(isinstance(name, str) for name in wanted)
+    require(is_list, key, "all or a list of experiments", wanted)
     return wanted
 
 
@@ -74,11 +93,11 @@ def sizes(names: Sequence[str], config: Mapping[str, Any]) -> dict[str, Any]:
     from imfvla.benchmarks.sizes import measure_size  # here, since imports take seconds
 
     found: dict[str, dict[str, Any]] = {}
-    for name in names:
-        for scale in SCALES:
+    with Progress("sizes", len(names) * len(SCALES)) as bar:
+        for name, scale in product(names, SCALES):
             composed = compose("train", [f"+exp={name}", f"scale={scale}"])
-            log.info("counting %s at scale %s", name, scale)
             found.setdefault(name, {})[scale] = measure_size(composed, evaluations(composed, config))
+            bar.advance(f"{name} at scale {scale}")
     size_table([(name, scale, size) for name in found for scale, size in found[name].items()]).print()
     return found
 
@@ -88,9 +107,15 @@ def evaluations(composed: Mapping[str, Any], config: Mapping[str, Any]) -> list[
     return config["nfe"] or composed["evaluation"]["nfe"]
 
 
-def measure_and_print(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
+def of_measured(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The composed experiment whose speed is measured."""
+    return compose("train", [f"+exp={experiment}", f"scale={config['at_scale']}", *config["overrides"]])
+
+
+def measure_and_print(
+    experiment: str, composed: Mapping[str, Any], config: Mapping[str, Any]
+) -> dict[str, Any]:
     """All figures of an experiment but its size."""
-    composed = compose("train", [f"+exp={experiment}", f"scale={config['at_scale']}", *config["overrides"]])
     log.info("measuring %s at scale %s", experiment, config["at_scale"])
     with tempfile.TemporaryDirectory() as scratch:
         figures = measure(composed, config, Path(scratch))
@@ -106,9 +131,9 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
     from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency
     from imfvla.benchmarks.simulation import make_environment, measure_demonstrations, measure_simulation
-    from imfvla.benchmarks.sizes import build_unfitted
     from imfvla.benchmarks.training import measure_training
     from imfvla.policy import build_policy
+    from imfvla.rehearsal import build_unfitted
     from imfvla.training.data import prepare_windows
 
     parts, figures = config["parts"], {}

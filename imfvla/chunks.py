@@ -11,6 +11,7 @@ from imfvla.errors import UserError
 from imfvla.nn.normaliser import Normaliser
 from imfvla.statistics import Statistics
 
+FRAMES = RELATIVE, ABSOLUTE = "relative", "absolute"
 MIN_SCALE = 2e-3  # rad, or share of a gripper's opening
 
 
@@ -25,9 +26,9 @@ class ChunkFrame(nn.Module):
 
     def __init__(self, frame: str, steps: int, channels: int) -> None:
         super().__init__()
-        if frame not in ("relative", "absolute"):
+        if frame not in FRAMES:
             raise UserError(f"action_frame must be relative or absolute, found {frame!r}.")
-        joints = [frame == "relative" and not name.endswith("gripper") for name in ACTION_NAMES[:channels]]
+        joints = [frame == RELATIVE and not name.endswith("gripper") for name in ACTION_NAMES[:channels]]
         self.relative: Tensor
         self.register_buffer("relative", torch.tensor(joints), persistent=False)
         self.normaliser = Normaliser(steps, channels)

@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
-from imfvla.options import build, require
+from imfvla.options import Limit, build, part_of, within
 from imfvla.progress import Progress
+from imfvla.protocol import MAX_WORKERS
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.rollout import run_episode
 from imfvla.views import ViewOptions
@@ -24,6 +25,8 @@ SEED_LIMIT = 10_000  # demonstrations may use the seeds below
 LOG_NAME = "collection.json"
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
 EPISODE_TIMEOUT_S = 900.0
+MAX_CAMERA_EVERY = 700  # control steps of an episode
+NOT_EMPTY = Limit("a text that is not empty", bool)
 log = logging.getLogger(__name__)
 
 
@@ -31,22 +34,20 @@ log = logging.getLogger(__name__)
 class DemoOptions:
     """Which demonstrations are wanted and where they live."""
 
-    episodes: int
-    first_seed: int
-    directory: str
-    frames_directory: str | None  # of the frame store, see imfvla.training.data
-    camera_every: int
-    workers: int | None
+    episodes: Annotated[int, within(1, SEED_LIMIT)]
+    first_seed: Annotated[int, within(0, SEED_LIMIT - 1)]
+    directory: Annotated[str, NOT_EMPTY]
+    frames_directory: Annotated[str, NOT_EMPTY] | None  # of the frame store, see imfvla.training.data
+    camera_every: Annotated[int, within(1, MAX_CAMERA_EVERY)]
+    workers: Annotated[int, within(0, MAX_WORKERS)] | None
 
-    def __post_init__(self) -> None:
-        require(self.episodes >= 1, "demos.episodes", "at least 1", self.episodes)
-        require(
-            0 <= self.first_seed < SEED_LIMIT, "demos.first_seed", f"in 0...{SEED_LIMIT - 1}", self.first_seed
-        )
-        require(self.camera_every >= 1, "demos.camera_every", "at least 1", self.camera_every)
-        require(
-            self.workers is None or self.workers >= 0, "demos.workers", "null or at least 0", self.workers
-        )
+
+@dataclass(frozen=True, slots=True)
+class SceneOptions:
+    """Which task is demonstrated; see `imfvla.tasks.load`."""
+
+    name: str
+    variant: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,42 +83,34 @@ class Report:
     wall_s: float
 
 
+def check_demonstrations(config: Mapping[str, Any]) -> None:
+    """Raises UserError where `config` (train.yaml composed) asks for demonstrations that cannot be recorded."""
+    _, settings = _read(*(part_of(config, key) for key in ("task", "observation", "demos")), "demos")
+    _stage_for(settings)
+
+
 def ensure_demonstrations(config: Mapping[str, Any]) -> Recordings:
     """Exactly the demonstrations that `config` (train.yaml composed) asks for.
 
     What is missing is collected first. Raises UserError as `collect` does.
     """
-    return collect(config["task"], config["observation"], config["demos"]).recordings
+    return collect(config["task"], config["observation"], config["demos"], "demos").recordings
 
 
-def read_options(
-    task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any]
-) -> tuple[DemoOptions, Settings]:
-    """The checked options of a collection. Raises UserError on bad ones."""
-    options = build(DemoOptions, demos, "demos")
-    expert = build(ExpertOptions, task["expert"], "task.expert")
-    seen = build(ViewOptions, {key: observation[key] for key in ("views", "image_size")}, "observation")
-    return options, Settings(
-        task=task["name"],
-        variant=task["variant"],
-        **asdict(expert),
-        **asdict(seen),
-        camera_every=options.camera_every,
-    )
-
-
-def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any]) -> Report:
+def collect(
+    task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str = ""
+) -> Report:
     """Records demonstrations until `demos.episodes` have succeeded, from `demos.first_seed` on.
 
     Each success becomes `episode-<seed>.mcap` in a folder of `demos.directory` named after task, variant, modes and
     image size. Complete files are kept, so that an interrupted collection resumes; the seeds of failed demonstrations
     are listed in `collection.json`. The seeds that are used depend on the settings alone, not on how the work was
-    shared out. Other files of the folder are left alone and not used.
+    shared out. Other files of the folder are left alone and not used. `where` is the key of `demos` in the config.
 
     Raises:
         UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
     """
-    options, settings = read_options(task, observation, demos)
+    options, settings = _read(task, observation, demos, where)
     _stage_for(settings)  # what cannot be simulated is told before anything is written
     began = time.perf_counter()
     height, width = settings.image_size
@@ -137,6 +130,28 @@ def collect(task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapp
             name = f"{name}-seeds{options.first_seed}-n{options.episodes}"
     names = [_path(directory, seed).name for seed in wanted]
     return Report(Recordings.named(directory, names, name), num_new, num_failed, time.perf_counter() - began)
+
+
+def _read(
+    task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str
+) -> tuple[DemoOptions, Settings]:
+    options = build(DemoOptions, demos, where)
+    expert = build(ExpertOptions, part_of({"task": task}, "task.expert"), "task.expert")
+    seen = {
+        key: part_of({"observation": observation}, f"observation.{key}") for key in ("views", "image_size")
+    }
+    shown = build(ViewOptions, seen, "observation")
+    scene = build(
+        SceneOptions, {key: part_of({"task": task}, f"task.{key}") for key in ("name", "variant")}, "task"
+    )
+    settings = Settings(
+        task=scene.name,
+        variant=scene.variant,
+        **asdict(expert),
+        **asdict(shown),
+        camera_every=options.camera_every,
+    )
+    return options, settings
 
 
 def _record_missing(

@@ -8,12 +8,24 @@ if __name__ == "__main__":
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from imfvla.command_line import quoted
 from imfvla.entry import entry_point
 from imfvla.errors import UserError
-from imfvla.evaluate import nfe_as_list, quoted, read_nfe
+from imfvla.evaluate import read_nfe
+from imfvla.options import build
+
+
+@dataclass(frozen=True, slots=True)
+class CompareOptions:
+    """conf/compare.yaml."""
+
+    runs: tuple[str, ...]
+    nfe: Any  # see `read_nfe`
+    output: str
 
 
 @entry_point("compare")
@@ -24,6 +36,7 @@ def _compare(config: dict[str, Any]) -> None:
     from imfvla.reporting.two_runs import compare_runs, table_of, verdict
     from imfvla.run_directory import RunDirectory
 
+    build(CompareOptions, config, "")
     if len(config["runs"]) != 2:
         raise UserError(
             f"compare needs two run directories, found {len(config['runs'])}: python -m imfvla.compare RUN_A RUN_B."
@@ -49,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command. Takes directories as they are: `RUN_A RUN_B` for `runs=[RUN_A,RUN_B]`."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     named = [text for text in arguments if os.path.exists(text) or not ("=" in text or text.startswith("-"))]
-    others = nfe_as_list([text for text in arguments if text not in named])
+    others = [text for text in arguments if text not in named]
     _compare([*others, f"runs=[{','.join(map(quoted, named))}]"] if named else others)
 
 

@@ -12,7 +12,7 @@ from imfvla.run_directory import (
     RunDirectory,
     differences,
     plain,
-    share_of,
+    step_of,
     training_steps,
 )
 
@@ -41,7 +41,7 @@ def is_reported(config: Mapping[str, Any], directory: Path) -> bool:
     """The same of a result, which has no weights."""
     try:
         steps = training_steps(config, directory)
-        return _has_evaluations(config, directory, share_of(steps, config["evaluation"]["checkpoint"]))
+        return _has_evaluations(config, directory, step_of(steps, config["evaluation"]["checkpoint"]))
     except (UserError, TypeError, KeyError):
         return False
 

@@ -79,11 +79,16 @@ def register_resolvers() -> None:
     OmegaConf.register_new_resolver("count", len, replace=True)
 
 
-def refuse_added_keys(config_name: str, overrides: Sequence[str]) -> None:
-    """Raises UserError for `+key=value` unless `key` is a group: all keys exist already, so it is a slip."""
+def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | None = None) -> None:
+    """Raises UserError for `+key=value` unless `key` is a group, of `conf` or of `more`: all keys exist already."""
+    roots = [CONFIG_DIRECTORY, *([more] if more else [])]
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
-        if override.is_add() and not key.startswith("hydra") and not (CONFIG_DIRECTORY / key).is_dir():
+        if (
+            override.is_add()
+            and not key.startswith("hydra")
+            and not any((root / key).is_dir() for root in roots)
+        ):
             raise _unknown_key(key, config_name, overrides)
 
 

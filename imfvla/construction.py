@@ -3,13 +3,15 @@
 import importlib
 import inspect
 import re
+import types
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import instantiate
 from torch.optim import Optimizer
 
 from imfvla.errors import UserError
+from imfvla.options import convert, is_whole, require
 
 # Whose classes a config may name. Constructors there compute; none writes a file, starts a process or evaluates text.
 PACKAGES = ("imfvla.encoders", "imfvla.generators", "imfvla.nn")
@@ -17,14 +19,17 @@ OPTIMISERS = "torch.optim"
 # `_args_` and `_recursive_` would change how a part is built from what its constructor says.
 SPECIAL_KEYS = ("_target_", "_partial_")
 MAX_DEPTH = 32
+MAX_COUNT = 10**6  # of layers, channels and whatever else is counted: more would not be built in a lifetime
+MAX_REASON = 200  # characters of what torch says
+CHECKED = (bool, int, float, str, types.NoneType)
 
 
 def construct(part: Mapping[str, Any], key: str) -> Any:
     """The object that `part`, a resolved config under `key`, describes; nested parts are built first.
 
-    Raises UserError, before anything is built, where a `_target_` is no class of `PACKAGES` and no optimiser of
-    torch, or where a text is an interpolation, which would read the environment. What a constructor raises passes
-    wrapped by Hydra.
+    Raises UserError, before anything is built, where a `_target_` is no class of `PACKAGES` and no optimiser of torch,
+    where a value is not as the types of the constructor and their `Limit` say, or where a text is an interpolation,
+    which would read the environment. What a constructor raises passes wrapped by Hydra.
     """
     if not isinstance(part, Mapping) or "_target_" not in part:
         raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
@@ -42,6 +47,32 @@ def refuse_foreign_target(target: Any, key: str) -> None:
             f"{key} must name a class defined in {', '.join(PACKAGES)}, or an optimiser of {OPTIMISERS}, "
             f"found {target!r}: a config from somewhere else must not choose what is run."
         )
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, without the stack of C++ that torch appends."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:MAX_REASON]
+
+
+def _check_arguments(part: Mapping[str, Any], key: str) -> None:
+    """Raises UserError where an argument of a class of ours is not as the types of its constructor say."""
+    module_name, _, name = part["_target_"].rpartition(".")
+    hints: dict[str, Any] = {}
+    for cls in reversed(
+        getattr(importlib.import_module(module_name), name).__mro__[:-1]
+    ):  # base classes first
+        hints |= get_type_hints(cls.__init__, include_extras=True)
+    for argument, value in part.items():
+        if _is_checked(hints.get(argument)):
+            convert(value, hints[argument], f"{key}.{argument}")
+
+
+def _is_checked(hint: Any) -> bool:
+    if get_origin(hint) is Annotated:
+        return _is_checked(get_args(hint)[0])
+    if get_origin(hint) in (Union, types.UnionType, tuple):
+        return all(map(_is_checked, get_args(hint)))
+    return hint in CHECKED
 
 
 def _is_ours(target: str) -> bool:
@@ -63,6 +94,8 @@ def _is_ours(target: str) -> bool:
 def _refuse_foreign(value: Any, key: str, depth: int) -> None:
     if depth > MAX_DEPTH:
         raise UserError(f"{key[:80]}... is nested deeper than {MAX_DEPTH} levels.")
+    if is_whole(value):
+        require(abs(value) <= MAX_COUNT, key, f"at most {MAX_COUNT}", value)
     if isinstance(value, Mapping):
         for name, item in value.items():
             where = f"{key}.{name}"
@@ -74,6 +107,8 @@ def _refuse_foreign(value: Any, key: str, depth: int) -> None:
                 )
             else:
                 _refuse_foreign(item, where, depth + 1)
+        if "_target_" in value and not value["_target_"].startswith(OPTIMISERS):
+            _check_arguments(value, key)
     elif isinstance(value, list | tuple):
         for number, item in enumerate(value):
             _refuse_foreign(item, f"{key}[{number}]", depth + 1)

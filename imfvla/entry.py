@@ -17,13 +17,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
-from imfvla.errors import REMEDIES, WHERE_MISSING, told
+from imfvla.command_line import in_hydras_words, multiplies, refuse_ignored
+from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, told
 from imfvla.jobs import Failure, Job
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
 
 def entry_point(
-    config_name: str, is_finished: IsFinished | None = None
+    config_name: str, is_finished: IsFinished | None = None, usage: Callable[[], str] | None = None
 ) -> Callable[[Callable[[dict[str, Any]], None]], Callable[..., None]]:
     """Decorator: `function(config)` becomes a command that composes `conf/<config_name>.yaml`.
 
@@ -31,7 +32,8 @@ def entry_point(
     on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C, 143
     after SIGTERM, 138 after SIGUSR1 (then the same command goes on); 1 with a traceback after anything else. In
     a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run but those that
-    `is_finished(config, directory)` tells from their files; the failures are listed at the end. The config
+    `is_finished(config, directory)` tells from their files; the failures are listed at the end. Where there is a
+    `usage`, a command without any override does nothing but tell it, and exits with 2. The config
     overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory, see
     `output_directory`, and its train.log) or both with `plain` (nothing written).
     """
@@ -40,7 +42,7 @@ def entry_point(
         @wraps(function)
         def main(argv: Sequence[str] | None = None) -> None:
             arguments = list(sys.argv[1:] if argv is None else argv)
-            code = _run(Job(function, config_name), arguments, is_finished)
+            code = _run(Job(function, config_name), arguments, is_finished, usage)
             if code:
                 sys.exit(code)
 
@@ -55,16 +57,27 @@ def output_directory() -> Path:
 
 
 @as_command
-def _run(job: Job, arguments: list[str], is_finished: IsFinished | None) -> int:
+def _run(
+    job: Job, arguments: list[str], is_finished: IsFinished | None, usage: Callable[[], str] | None
+) -> int:
     composition.register_resolvers()
+    known = get_args_parser().parse_intermixed_args(arguments)
+    is_bare = not (known.overrides or _shows_only(known))
+    is_sweep = _is_sweep(known)
+    flags = [text for text in arguments if text not in known.overrides]
+    known.overrides = in_hydras_words(known.overrides, is_sweep)
     if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
-        arguments = [*arguments, "hydra/job_logging=disabled"]
-    known = get_args_parser().parse_args(arguments)
+        known.overrides.append("hydra/job_logging=disabled")
+    arguments = [*flags, *known.overrides]  # Hydra takes no override behind a flag that is behind one
     try:
         with _hydra_raises(arguments):
-            composition.refuse_added_keys(job.config_name, known.overrides)
-            if _is_sweep(known):
-                failures = run_sweep(job, known.overrides, is_finished)
+            refuse_ignored(known, is_sweep)
+            if usage and is_bare:
+                raise UserError(usage())
+            more = Path(known.config_dir).absolute() if known.config_dir else None
+            composition.refuse_added_keys(job.config_name, known.overrides, more)
+            if is_sweep:
+                failures = run_sweep(job, known.overrides, is_finished, more)
             else:
                 _run_once(job)
                 failures = [job.failure] if job.failure else []
@@ -83,8 +96,11 @@ def _run_once(job: Job) -> None:
 
 
 def _is_sweep(known: argparse.Namespace) -> bool:
-    shows_only = known.help or known.hydra_help or known.cfg or known.info or known.shell_completion
-    return not shows_only and (known.multirun or names_a_sweep(known.overrides))
+    return not _shows_only(known) and (multiplies(known) or names_a_sweep(known.overrides))
+
+
+def _shows_only(known: argparse.Namespace) -> bool:
+    return bool(known.help or known.hydra_help or known.cfg or known.info or known.shell_completion)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from imfvla.errors import UserError
 from imfvla.fingerprint import fingerprint, physical_cores
 from imfvla.options import require
 from imfvla.progress import Progress
-from imfvla.protocol import USUAL_NOISE, Protocol
+from imfvla.protocol import EvaluationOptions, Protocol
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory, flatten
@@ -22,62 +22,22 @@ REQUIRED_KEYS = ("name", "task.name", "task.variant", "observation.views", "obse
 
 
 def evaluate(
-    run: RunDirectory,
-    *,
-    episodes: int,
-    first_seed: int,
-    nfe: Sequence[int],
-    workers: int | None = None,
-    episode_timeout_s: float | None = None,
-    checkpoint: int | str = "last",
-    noise_seed: int = 0,
-    noise_scale: float = USUAL_NOISE,
-    max_steps: int | None = None,
-    device: str = "cpu",
-    recordings: bool = True,
-    overwrite: bool = False,
-    build: Build = load_workbench,
+    run: RunDirectory, options: EvaluationOptions, *, build: Build = load_workbench
 ) -> list[dict[str, Any]]:
     """Rolls the policy of `run` out from the seeds `first_seed, first_seed + 1, ...`, once for each of `nfe`.
 
     For each, writes `rollouts/<name>/` with `episodes.jsonl` (ordered by seed, equal for equal protocols
     but for the key "timing"), `summary.json`, and, with `recordings`, MCAP and mp4 of the best, the
     median and the worst episode. An interrupted evaluation goes on where it stopped; a finished one is
-    not repeated, unless `overwrite`.
-
-    Args:
-      workers: processes with one thread each; 0 works in this process; None takes the physical cores.
-      episode_timeout_s: an episode that takes a worker longer is played again by a fresh one; None: no limit.
-      checkpoint: training step of the weights, or "last".
-      noise_seed: of the noise streams; equal for policies that are to be compared.
-      noise_scale: of the noise that a chunk starts from, in 0 ... 1; below 1 samples are nearer to each other.
-      max_steps: control steps of an episode, None for all.
-      device: where the policy computes: "cpu" or "cuda".
-      build: makes environment and policy, in each worker once.
+    not repeated, unless `overwrite`. `build` makes environment and policy, in each worker once.
 
     Returns:
       The summaries, in the order of `nfe`.
 
     Raises:
-      UserError: no run, no such weights, numbers out of range, or an episode whose workers died.
+      UserError: no run, no such weights, no such device, or an episode whose workers died.
     """
-    nfe = tuple(nfe)
-    require(episodes >= 1, "episodes", "at least 1", episodes)
-    require(first_seed >= 0, "first_seed", "at least 0", first_seed)
-    require(bool(nfe) and min(nfe) >= 1, "nfe", "one or more whole numbers of at least 1", list(nfe))
-    require(workers is None or workers >= 0, "workers", "null or at least 0", workers)
-    require(
-        episode_timeout_s is None or episode_timeout_s > 0,
-        "episode_timeout_s",
-        "null or above 0",
-        episode_timeout_s,
-    )
-    require(0 <= noise_scale <= 1, "noise_scale", "in 0 ... 1", noise_scale)
-    require(max_steps is None or max_steps >= 1, "max_steps", "null or at least 1", max_steps)
-    require(device in ("cpu", "cuda"), "device", "cpu or cuda", device)
-    require(
-        device == "cpu" or torch.cuda.is_available(), "device", "cpu, as torch finds no CUDA device", device
-    )
+    require_device(options.device, "device")
     config = run.config()
     missing = [key for key in REQUIRED_KEYS if key not in flatten(config)]
     if missing:
@@ -85,35 +45,44 @@ def evaluate(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
     run.refuse_links_outside()
-    step = run.weights_step(checkpoint)
+    step = run.weights_step(options.checkpoint)
     weights = run.policy_weights(step)
     if not weights.exists():
         raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
     digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
-    count = physical_cores() if workers is None else workers
+    count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
     summaries = []
-    with worker_pool(count, episode_timeout_s) as run_all:
-        for number in nfe:
+    with worker_pool(count, options.episode_timeout_s) as run_all:
+        for number in options.nfe:
             protocol = Protocol(
                 task=config["task"]["name"],
                 variant=config["task"]["variant"],
                 checkpoint_step=step,
                 weights=digest,
                 nfe=number,
-                noise_seed=noise_seed,
-                noise_scale=float(noise_scale),
-                first_seed=first_seed,
-                episodes=episodes,
-                max_steps=max_steps,
-                device=device,
+                noise_seed=options.noise_seed,
+                noise_scale=options.noise_scale,
+                first_seed=options.first_seed,
+                episodes=options.episodes,
+                max_steps=options.max_steps,
+                device=options.device,
             )
-            job = Job(build, run.path, step, number, noise_seed, protocol.noise_scale, max_steps, device)
+            job = Job(
+                build,
+                run.path,
+                step,
+                number,
+                options.noise_seed,
+                options.noise_scale,
+                options.max_steps,
+                options.device,
+            )
             name = protocol.name(run.weight_steps()[-1])
-            with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=overwrite) as rollouts:
+            with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=options.overwrite) as rollouts:
                 if rollouts.summary is None:
                     incidents_before = run_all.incidents
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
-                    files = _record_some(job, rows, rollouts, run_all) if recordings else {}
+                    files = _record_some(job, rows, rollouts, run_all) if options.recordings else {}
                     (renderer,) = run_all(gl_renderer, [(job,)])
                     summary = {
                         **summarise(rows),
@@ -132,6 +101,11 @@ def evaluate(
     return summaries
 
 
+def require_device(device: str, key: str) -> None:
+    """Raises UserError where the option `key` wants a GPU and there is none."""
+    require(device == "cpu" or torch.cuda.is_available(), key, "cpu, as torch finds no CUDA device", device)
+
+
 def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: Here | Pool) -> list[Row]:
     """The rows of all seeds, ordered, those that were missing freshly made."""
     rows = {row["seed"]: row for row in rollouts.rows}
@@ -148,8 +122,10 @@ def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: H
     """Plays the best, the median and the worst episode again into files; says which they are."""
     chosen = best_median_worst(rows)
     paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}
-    for _ in run_all(record, [(job, row, paths[label]) for label, row in chosen.items()]):
-        pass
+    calls = [(job, row, paths[label]) for label, row in chosen.items()]
+    with Progress(f"recording {', '.join(chosen)} of nfe {job.nfe}", len(calls)) as bar:
+        for _ in run_all(record, calls):
+            bar.advance()
     return {
         label: {"seed": row["seed"], "return": row["total_reward"], "file": paths[label].name}
         for label, row in chosen.items()

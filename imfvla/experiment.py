@@ -5,20 +5,19 @@ import os
 import traceback
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from imfvla.collection import ensure_demonstrations, read_options
+from imfvla.collection import check_demonstrations, ensure_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
-from imfvla.horizon import Horizon
 from imfvla.nn.pretrained import initialise_from_pretrained
-from imfvla.options import build, require
 from imfvla.policy import build_policy
+from imfvla.protocol import EvaluationOptions
+from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.table_row import print_row
 from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
 from imfvla.training.data import make_loader, prepare_windows
@@ -31,48 +30,23 @@ INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluationOptions:
-    """The protocol that ends a training run."""
-
-    episodes: int
-    first_seed: int
-    nfe: tuple[int, ...]
-    checkpoint: str
-    noise_seed: int
-    noise_scale: float
-    device: str
-    workers: int | None
-    episode_timeout_s: float | None
-
-    def __post_init__(self) -> None:
-        require(self.episodes >= 1, "evaluation.episodes", "at least 1", self.episodes)
-        require(self.first_seed >= 0, "evaluation.first_seed", "at least 0", self.first_seed)
-        require(0 <= self.noise_scale <= 1, "evaluation.noise_scale", "in 0 ... 1", self.noise_scale)
-        require(bool(self.nfe), "evaluation.nfe", "one or more numbers of evaluations", self.nfe)
-
-
 def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     """Does what is not done yet of the experiment in `run` and prints its row.
 
     `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
     traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be had.
     """
-    training = build(TrainingOptions, config["training"], "training")
-    optim = build(OptimOptions, config["optim"], "optim")
-    evaluation = build(EvaluationOptions, config["evaluation"], "evaluation")
-    build(Horizon, config["horizon"], "horizon")
-    read_options(config["task"], config["observation"], config["demos"])
-    policy = build_policy(config)  # what does not fit together is told before demonstrations are collected
-    if not run.last_state.exists() and training.steps not in run.weight_steps():
-        initialise_from_pretrained(policy)
-    for nfe in evaluation.nfe:
-        policy.generator.check_nfe(nfe)
-    seed = config["seed"]
-    require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
+    options = read_options(config)
+    training, optim, evaluation = options.training, options.optim, options.evaluation
+    is_trained = training.steps in run.weight_steps()
+    policy = rehearse(config, evaluation.nfe)
+    if not is_trained:
+        check_demonstrations(config)
+        if not run.last_state.exists():
+            initialise_from_pretrained(policy)
     run.refuse_links_outside()
     with joined_processes(training.device) as processes:
-        if training.steps not in run.weight_steps():  # else there is nothing to train
+        if not is_trained:
             processes.check(training)
         if processes.is_first:
             _run_stages(config, run, training, optim, evaluation, processes)
@@ -99,7 +73,7 @@ def _run_stages(
             else:
                 _train(config, run, training, optim, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
-            evaluate(run, **asdict(evaluation))  # of a finished evaluation it only reads the summary
+            evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
             if run.status().get("state") != DONE:
                 run.write_status(DONE)
         except KeyboardInterrupt:

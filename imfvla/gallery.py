@@ -6,31 +6,33 @@ if __name__ == "__main__":
     begin()
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from imfvla.entry import entry_point
 from imfvla.episode import CONTROL_HZ
 from imfvla.files import write_together
-from imfvla.options import require
+from imfvla.options import build, within
 
 MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
 
 
+@dataclass(frozen=True, slots=True)
+class GalleryOptions:
+    """conf/gallery.yaml, the task apart."""
+
+    seed: Annotated[int, within(0, 2**31)]
+    size: Annotated[int, within(16, 960)]
+    directory: str
+
+
 @entry_point("gallery")
 def main(config: dict[str, Any]) -> None:
-    require(
-        isinstance(config["seed"], int) and config["seed"] >= 0,
-        "seed",
-        "a whole number of at least 0",
-        config["seed"],
-    )
-    require(
-        isinstance(config["size"], int) and 16 <= config["size"] <= 960, "size", "in 16...960", config["size"]
-    )
-    for path in write_gallery(config["task"], config["seed"], config["size"], Path(config["directory"])):
+    options = build(GalleryOptions, {key: value for key, value in config.items() if key != "task"}, "")
+    for path in write_gallery(config["task"], options.seed, options.size, Path(options.directory)):
         print(path)
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from imfvla.errors import UserError
 
+MAX_STEPS = 1000  # more than an episode has
+
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
@@ -27,8 +29,10 @@ class Horizon:
     def __post_init__(self) -> None:
         for name in ("obs", "pred", "exec"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise UserError(f"horizon.{name} must be a whole number of at least 1, found {value!r}.")
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_STEPS:
+                raise UserError(
+                    f"horizon.{name} must be a whole number between 1 and {MAX_STEPS}, found {value!r}."
+                )
         if self.exec > self.pred:
             raise UserError(
                 f"horizon.exec must not exceed horizon.pred: only predicted actions can be executed, "

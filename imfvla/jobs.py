@@ -7,11 +7,12 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
-from imfvla.errors import told
+from imfvla.errors import UserError, told
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +41,29 @@ class Job:
 
     def __init__(self, function: Callable[[dict[str, Any]], None], config_name: str) -> None:
         self.function, self.config_name = function, config_name
+        self.is_of_sweep = False
         self.failure: Failure | None = None  # of the last call in this process
 
     def __call__(self, config: DictConfig) -> Failure | None:
         self.failure = None
         overrides = " ".join(HydraConfig.get().overrides.task)
         try:
+            self._refuse_hydras_own_ways(HydraConfig.get())
             self.function(composition.to_plain(config))
         except Exception as error:  # told at the end, so that the other jobs of a sweep run
             self.failure = Failure.of(error, self.config_name, overrides)
         return self.failure
+
+    def _refuse_hydras_own_ways(self, hydra: DictConfig) -> None:
+        """Raises UserError where a config file changes how Hydra runs jobs to what is not supported here."""
+        if hydra.mode == RunMode.MULTIRUN and not self.is_of_sweep:
+            raise UserError(
+                "hydra.mode is MULTIRUN in a config file: remove it there and add -m to the command."
+            )
+        if hydra.job.chdir:
+            raise UserError(
+                "hydra.job.chdir must be false, found true: paths are relative to where the command is started."
+            )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

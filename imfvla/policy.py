@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.chunks import ChunkFrame
-from imfvla.construction import construct
+from imfvla.construction import construct, reason_of
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
@@ -85,7 +85,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         reason = error.__cause__ or error
         if isinstance(reason, UserError):
             raise reason from None
-        raise UserError(f"the configured policy cannot be built: {reason}") from error
+        raise UserError(f"the configured policy cannot be built: {reason_of(reason)}") from error
     wanted, found = policy.generator.core_interface, policy.core.interface
     if wanted != found:
         raise UserError(

@@ -49,6 +49,8 @@ class Progress:
             if self._is_outermost:
                 Progress._display = self._bar
                 self._bar.start()
+        elif self._shown and self._done < self._total:
+            log.info("%s: %d of %d", self._title, self._done, self._total)
         return self
 
     def advance(self, note: str = "") -> None:

@@ -1,10 +1,66 @@
-"""The protocol of an evaluation: what its rows depend on, beside the code. Needs neither torch nor mujoco."""
+"""What is asked of an evaluation, and what its rows depend on beside the code. Needs neither torch nor mujoco."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from fractions import Fraction
+from typing import Annotated, Any
+
+from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
+LAST = "last"  # of the weights that are kept
+MAX_SEED = 2**32 - 1  # numpy's generators and MuJoCo's start states take no higher one
+MAX_EPISODES = 1_000_000
+MAX_WORKERS = 1024
+MAX_TIMEOUT_S = 7 * 24 * 3600
+
+
+def _is_checkpoint(value: int | str) -> bool:
+    if value == LAST or re.fullmatch(r"[1-9]\d*", str(value)):
+        return True
+    return bool(re.fullmatch(r"[1-9]\d*/[1-9]\d*", str(value))) and Fraction(value) <= 1
+
+
+CHECKPOINT = Limit(
+    "last, a training step of at least 1, or a share of the training such as 1/3", _is_checkpoint
+)
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationOptions:
+    """What a user chooses of an evaluation: conf/evaluate.yaml, or the `evaluation` of an experiment.
+
+    Attributes:
+      checkpoint: the training step of the weights, a share of the training such as "1/3", or "last".
+      noise_seed: of the noise streams; equal for policies that are to be compared.
+      noise_scale: of the noise that a chunk starts from; below 1 samples are nearer to each other.
+      device: where the policy computes.
+      workers: processes with one thread each; 0 works in this process; None takes the physical cores.
+      episode_timeout_s: an episode that takes a worker longer is played again by a fresh one; None: no limit.
+      max_steps: control steps of an episode, None for all.
+      recordings: whether the best, the median and the worst episode are recorded.
+      overwrite: whether a finished evaluation is repeated.
+    """
+
+    episodes: Annotated[int, within(1, MAX_EPISODES)]
+    first_seed: Annotated[int, within(0, MAX_SEED)]
+    nfe: Annotated[tuple[int, ...], some(at_least(1))]
+    checkpoint: Annotated[int | str, CHECKPOINT] = LAST
+    noise_seed: Annotated[int, within(0, MAX_SEED)] = 0
+    noise_scale: Annotated[float, within(0, 1)] = USUAL_NOISE
+    device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
+    workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
+    episode_timeout_s: (
+        Annotated[float, above(0), Limit("at most a week", lambda s: s <= MAX_TIMEOUT_S)] | None
+    ) = None
+    max_steps: Annotated[int, at_least(1)] | None = None
+    recordings: bool = True
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        last = self.first_seed + self.episodes - 1
+        require(last <= MAX_SEED, "the last seed, first_seed + episodes - 1,", f"at most {MAX_SEED}", last)
 
 
 @dataclass(frozen=True, slots=True)

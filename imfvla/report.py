@@ -5,6 +5,7 @@ from imfvla.command import begin
 if __name__ == "__main__":
     begin()
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,26 @@ from hydra.core.global_hydra import GlobalHydra
 
 from imfvla.composition import compose
 from imfvla.entry import entry_point
-from imfvla.options import require
+from imfvla.options import build
 from imfvla.run_directory import RunDirectory
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOptions:
+    """conf/report.yaml."""
+
+    run: str | None
+    directories: tuple[str, ...]
+    mapping: str | None
+    method: tuple[str, ...]
+    output: str
+    media: bool
 
 
 @entry_point("report")
 def main(config: dict[str, Any]) -> None:
     """Prints the rows of one run, or publishes the tables of all runs: Markdown, CSV, LaTeX, figures and a page."""
+    options = build(ReportOptions, config, "")
     if config["run"]:
         from imfvla.reporting.table_row import print_row
 
@@ -27,12 +41,11 @@ def main(config: dict[str, Any]) -> None:
     from imfvla.publication import publish  # after the config is checked: a slip is told at once
     from imfvla.reporting.mapping import PATH, read_mapping
 
-    mapping = read_mapping(Path(config["mapping"]) if config["mapping"] else PATH)
-    directories = [Path(directory) for directory in config["directories"]]
+    mapping = read_mapping(Path(options.mapping) if options.mapping else PATH)
+    directories = [Path(directory) for directory in options.directories]
     GlobalHydra.instance().clear()  # the method is composed below
-    method = compose("train", config["method"])
-    require(isinstance(config["media"], bool), "media", "true or false", config["media"])
-    publication = publish(directories, Path(config["output"]), mapping, method, media=config["media"])
+    method = compose("train", options.method)
+    publication = publish(directories, Path(options.output), mapping, method, media=options.media)
     paths = publication.write()
     for table in publication.tables:
         table.print()

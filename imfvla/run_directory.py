@@ -22,11 +22,10 @@ import yaml
 from imfvla.documents import read_json, read_yaml
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, take_lock, write_json, write_text
+from imfvla.options import require
+from imfvla.protocol import CHECKPOINT, LAST
 
 RUNNING, DONE, FAILED = "running", "done", "failed"
-LAST = (
-    "last"  # of the weights that are kept; others are named by a step, or a share of the training such as 1/3
-)
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
     "evaluation",
@@ -82,7 +81,7 @@ class RunDirectory:
         return self.weights_directory(self.weights_step(step)) / "policy.safetensors"
 
     def weights_step(self, step: int | str = LAST) -> int:
-        """The training step of kept weights: of a step, of the last one, or of a share of the training such as "1/3".
+        """The training step of kept weights that a checkpoint names: see `EvaluationOptions.checkpoint`.
 
         Raises UserError where there are none.
         """
@@ -92,13 +91,13 @@ class RunDirectory:
                 f"{self.path} has no weights in checkpoints/step-*: wanted a run that has trained."
             )
         if step == LAST:
-            step = steps[-1]
-        elif re.fullmatch(r"[1-9]\d*/[1-9]\d*", str(step)):
-            step = share_of(self.training_steps(), str(step))
-        if step not in steps:
+            return steps[-1]
+        if "/" in str(step):
+            step = step_of(self.training_steps(), step)
+        if str(step) not in map(str, steps):
             kept = ", ".join(str(known) for known in steps)
             raise UserError(
-                f"{self.checkpoints} has no weights of step {step!r}: kept are {kept}, or take last."
+                f"{self.checkpoints} has no weights of step {step}: kept are {kept}, or take last."
             )
         return int(step)
 
@@ -183,9 +182,15 @@ def training_steps(config: Mapping[str, Any], run: Path) -> int:
     return steps
 
 
-def share_of(steps: int, checkpoint: str) -> int:
-    """The step of the last weights, or of those of a share such as "1/3", in a training of so many steps."""
-    return steps if checkpoint == LAST else round(steps * Fraction(checkpoint))
+def step_of(steps: int, checkpoint: int | str) -> int:
+    """The step that a checkpoint names in a training of so many steps: see `EvaluationOptions.checkpoint`.
+
+    Raises UserError where it names none.
+    """
+    require(CHECKPOINT.holds(checkpoint), "checkpoint", CHECKPOINT.wanted, checkpoint)
+    if checkpoint == LAST:
+        return steps
+    return round(steps * Fraction(checkpoint)) if "/" in str(checkpoint) else int(checkpoint)
 
 
 def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:

@@ -1,13 +1,17 @@
 """What a finished run leaves behind for good: a policy that others can evaluate, or a result without its weights."""
 
+import re
+import shlex
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, copy_file, write_json, write_text
 from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import DONE, LAST, RunDirectory
+from imfvla.run_directory import DONE, LAST, RunDirectory, flatten
 
 MAX_BYTES = 8_000_000  # of the weights
 THINNING = 10
@@ -53,14 +57,25 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     return made_by
 
 
+def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
+    """The command that made a run, from the name of its directory and, where that has lost brackets, its config."""
+    values = flatten(config)
+    name = "" if run.path.name == "default" else run.path.name
+    overrides = []
+    for text in re.split(r",(?=[\w./@-]+=)", name) if name else []:
+        key = text.partition("=")[0]
+        value = values.get(key)
+        overrides.append(f"{key}=[{','.join(map(str, value))}]" if isinstance(value, list) else text)
+    return shlex.join(["python", "-m", "imfvla.train", f"+exp={config['name']}", *overrides])
+
+
 def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
     """Command, commit, seed and results of a run."""
     config = run.config()
     made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
-    overrides = "" if run.path.name == "default" else " " + run.path.name.replace(",", " ")
     shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
     return {
-        "command": f"python -m imfvla.train +exp={config['name']}{overrides}",
+        "command": command_of(run, config),
         "seed": config["seed"],
         "code": made["fingerprint"]["code"],
         "steps": made["step"],

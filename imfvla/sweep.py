@@ -15,9 +15,11 @@ from typing import Any
 
 from hydra import initialize_config_dir
 from hydra._internal.callbacks import Callbacks
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -26,13 +28,16 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
+from imfvla.errors import UserError
 from imfvla.jobs import Failure, Job
-from imfvla.options import build, require
+from imfvla.options import build, is_whole, require
 from imfvla.progress import Progress
 from imfvla.reporting.mapping import LAST, TableRow, read_mapping
 from imfvla.reporting.paper import TABLES
+from imfvla.run_directory import EXECUTION_KEYS, differences
 
 GROUP = "sweep"
 LOOK_EVERY_S = 5.0  # seconds between looks at what jobs in other processes have finished
@@ -64,39 +69,52 @@ def names_a_sweep(overrides: Sequence[str]) -> bool:
     return any(composition.key_of(text) == GROUP for text in overrides)
 
 
-def run_sweep(job: Job, overrides: Sequence[str], is_finished: IsFinished | None) -> list[Failure]:
+def run_sweep(
+    job: Job, overrides: Sequence[str], is_finished: IsFinished | None, more: Path | None = None
+) -> list[Failure]:
     """Runs the jobs that are not finished and returns what failed; one failure stops no other job.
 
     Args:
       job: the task function.
       overrides: of the command line.
       is_finished: tells from a job's config and directory that nothing is left to do; None where nothing tells.
+      more: a directory of configs beside `conf`, as --config-dir names it.
 
     Raises:
       UserError, HydraException: a job that cannot be composed, before any runs.
     """
-    with _composed(job.config_name, overrides, with_log_configuration=True) as (loader, master, chosen):
-        context = HydraContext(config_loader=loader, callbacks=Callbacks(master))
+    job.is_of_sweep = True
+    with _composed(job.config_name, overrides, True, more) as (loader, master, chosen):
+        callbacks = Callbacks(master)
+        context = HydraContext(config_loader=loader, callbacks=callbacks)
         planned = plan(loader, master, chosen)
         launcher = Plugins.instance().instantiate_launcher(context, job, master)
-        is_here = master.hydra.launcher._target_ == f"{BasicLauncher.__module__}.{BasicLauncher.__qualname__}"
-        return _Sweep(launcher, is_here, job.config_name, is_finished).run(planned)
+        is_here = master.hydra.launcher._target_ == _path_of(BasicLauncher)
+        callbacks.on_multirun_start(config=master, config_name=job.config_name)
+        size = master.hydra.sweeper.max_batch_size
+        failures = _Sweep(launcher, is_here, job.config_name, is_finished, size).run(planned)
+        callbacks.on_multirun_end(config=master, config_name=job.config_name)
+        return failures
 
 
 def planned_jobs(config_name: str, overrides: Sequence[str]) -> list[Planned]:
     """The jobs that `run_sweep` would look at, in its order; raises as it does."""
-    with _composed(config_name, overrides, with_log_configuration=False) as (loader, master, chosen):
+    with _composed(config_name, overrides, False) as (loader, master, chosen):
         return plan(loader, master, chosen)
 
 
 @contextmanager
 def _composed(
-    config_name: str, overrides: Sequence[str], with_log_configuration: bool
+    config_name: str, overrides: Sequence[str], with_log_configuration: bool, more: Path | None = None
 ) -> Iterator[tuple[ConfigLoader, DictConfig, list[str]]]:
     """Hydra's loader, the config that all jobs have in common, and the overrides that name sweeps."""
     directory = str(composition.config_directory())
     with initialize_config_dir(directory, version_base=composition.VERSION_BASE, job_name=config_name):
         hydra = GlobalHydra.instance().hydra
+        if more is not None:
+            search_path = hydra.config_loader.get_search_path()
+            search_path.prepend("command-line", f"file://{more}", SearchPathQuery(provider="schema"))
+            hydra.config_loader = ConfigLoaderImpl(search_path)  # which lists its sources when it is made
         common = [text for text in overrides if composition.key_of(text) != GROUP]
         chosen = [text for text in overrides if composition.key_of(text) == GROUP]
         master = hydra.compose_config(config_name, common, RunMode.MULTIRUN, with_log_configuration)
@@ -104,15 +122,20 @@ def _composed(
 
 
 def plan(loader: ConfigLoader, master: DictConfig, chosen: Sequence[str]) -> list[Planned]:
-    """The jobs of `+sweep=...` under the overrides of `master`, or of these alone; none twice."""
+    """The jobs of `+sweep=...` under the overrides of `master`, or of these alone; none twice.
+
+    As with Hydra's sweeper, `hydra.sweeper.params` come before the overrides. Raises UserError for another sweeper.
+    """
     parser = OverridesParser.create(config_loader=loader)
-    common = list(master.hydra.overrides.task)
+    common = [*_params_of(master), *master.hydra.overrides.task]
     files = [name for override in parser.parse_overrides(list(chosen)) for name in _names(override)]
     config_name = master.hydra.job.config_name
     lists = [job for name in files for job in _jobs_of_file(loader, config_name, name)] if files else [()]
     products = [BasicSweeper.split_arguments(parser.parse_overrides([*own, *common]), None) for own in lists]
     every = dict.fromkeys(tuple(job) for (product,) in products for job in product)
-    return [_planned(loader, master, job) for job in every]
+    planned = [_planned(loader, master, job) for job in every]
+    _refuse_shared_directories(planned)
+    return planned
 
 
 def jobs_of_rows(rows: Sequence[TableRow]) -> list[tuple[str, ...]]:
@@ -144,10 +167,16 @@ def waves(planned: Sequence[Planned]) -> list[list[Planned]]:
 
 class _Sweep:
     def __init__(
-        self, launcher: Launcher, is_here: bool, config_name: str, is_finished: IsFinished | None
+        self,
+        launcher: Launcher,
+        is_here: bool,
+        config_name: str,
+        is_finished: IsFinished | None,
+        max_batch_size: int | None = None,
     ) -> None:
         self._launcher, self._is_here = launcher, is_here
         self._config_name, self._is_finished = config_name, is_finished
+        self._size = 1 if is_here else max_batch_size
 
     def run(self, planned: Sequence[Planned]) -> list[Failure]:
         waiting = [job for job in planned if not self._has_finished(job)]
@@ -176,8 +205,11 @@ class _Sweep:
 
     def _batches(self, waiting: Sequence[Planned]) -> list[list[Planned]]:
         """What the launcher gets at once; in this process job by job, so that none can end the sweep of the others."""
-        found = waves(waiting)
-        return [[job] for wave in found for job in wave] if self._is_here else found
+        batches = []
+        for wave in waves(waiting):
+            size = self._size or len(wave)
+            batches += [wave[first : first + size] for first in range(0, len(wave), size)]
+        return batches
 
     def _launch(self, batch: Sequence[Planned], number: int) -> list[Failure]:
         try:
@@ -212,6 +244,43 @@ class _Sweep:
             bar.advance()
 
 
+def _path_of(plugin: type) -> str:
+    return f"{plugin.__module__}.{plugin.__qualname__}"
+
+
+def _params_of(config: DictConfig) -> list[str]:
+    """`hydra.sweeper.params` as overrides. Raises UserError where the sweeper is not Hydra's basic one."""
+    sweeper = config.hydra.sweeper
+    require(
+        sweeper._target_ == _path_of(BasicSweeper),
+        "hydra/sweeper",
+        "basic, since commands run the jobs of a sweep in their own way",
+        sweeper._target_,
+    )
+    size = sweeper.max_batch_size
+    require(
+        size is None or (is_whole(size) and size >= 1),
+        "hydra.sweeper.max_batch_size",
+        "null or at least 1",
+        size,
+    )
+    params = OmegaConf.to_container(sweeper.params, resolve=True) if sweeper.params else {}
+    require(isinstance(params, dict), "hydra.sweeper.params", "a mapping of keys to choices", params)
+    return [f"{key}={value}" for key, value in params.items()]
+
+
+def _refuse_shared_directories(planned: Sequence[Planned]) -> None:
+    """Raises UserError where jobs that train different policies would do so in one directory."""
+    first: dict[Path, Planned] = {}
+    for job in planned:
+        other = first.setdefault(job.directory, job)
+        if job.directory.name and (told := differences(other.config, job.config, EXECUTION_KEYS)):
+            raise UserError(
+                f"Two jobs of this sweep would share {job.directory}, though {'; '.join(told)}: leave "
+                "hydra.sweep.dir and hydra.sweep.subdir as they are, or let subdir name every key that differs."
+            )
+
+
 def _names(override: Override) -> list[str]:
     if override.is_sweep_override():
         return list(override.sweep_string_iterator())
@@ -232,8 +301,18 @@ def _planned(loader: ConfigLoader, master: DictConfig, overrides: tuple[str, ...
     before = HydraConfig.instance().cfg
     HydraConfig.instance().set_config(config)  # the name of the directory is found in it
     try:
-        directory = Path(config.hydra.sweep.dir) / config.hydra.sweep.subdir
+        directory = Path(config.hydra.sweep.dir) / str(config.hydra.sweep.subdir)
+    except OmegaConfBaseException as error:
+        raise UserError(
+            f"hydra.sweep.dir and hydra.sweep.subdir must follow from the config and the overrides alone, so that a "
+            f"sweep finds its jobs again; found {' '.join(str(error).split())}"
+        ) from error
     finally:
         HydraConfig.instance().cfg = before
+    if _params_of(config) != _params_of(master):
+        raise UserError(
+            f"{' '.join(overrides)} has hydra.sweeper.params of its own, which the job of a sweep cannot multiply: "
+            "name its experiment alone, or write its choices on the command line."
+        )
     plain = composition.to_plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
     return Planned(overrides, plain, directory)

@@ -11,11 +11,21 @@ if __name__ == "__main__":
 from typing import Any
 
 from imfvla.completion import is_complete
+from imfvla.composition import CONFIG_DIRECTORY
 from imfvla.entry import entry_point, output_directory
 from imfvla.run_directory import RunDirectory
 
 
-@entry_point("train", is_complete)
+def usage() -> str:
+    """What to type, where nothing was."""
+    names = ", ".join(sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml")))
+    return (
+        f"Name an experiment: python -m imfvla.train +exp=NAME [key=value ...]. There are {names}. Any other override "
+        "will do too: task=transfer trains on that task with the options of conf/train.yaml. --help shows all keys."
+    )
+
+
+@entry_point("train", is_complete, usage)
 def main(config: dict[str, Any]) -> None:
     from imfvla.experiment import run_experiment  # after the config is composed: a slip is told at once
 

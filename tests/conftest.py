@@ -1,9 +1,14 @@
 """Fixtures that several packages' tests share."""
 
+import sys
 from pathlib import Path
 
 import pytest
+from absl.logging import get_absl_handler
 from synthetic import write_demonstrations
+
+# It would hold the stream that pytest captures, and close it where Hydra sets logging up.
+get_absl_handler().python_handler.setStream(sys.__stderr__)
 
 
 @pytest.fixture

@@ -10,10 +10,11 @@ from fakes import FakeEnvironment
 from imfvla.bench import main
 from imfvla.benchmarks.clock import rate, threads, times_ms
 from imfvla.benchmarks.latency import measure_latency
-from imfvla.benchmarks.sizes import build_unfitted, measure_size
+from imfvla.benchmarks.sizes import measure_size
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP as PARTS
 from imfvla.benchmarks.tables import latency_table, speed_ratios
 from imfvla.composition import compose
+from imfvla.rehearsal import build_unfitted
 from imfvla.reporting.mapping import read_mapping
 
 TOY = (
@@ -54,10 +55,10 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("latency_calls=0", "latency_calls must be a whole number of at least 1, found 0"),
+        ("latency_calls=0", "latency_calls must be between 1 and 1000000, found 0"),
         (
             "parts=[speed]",
-            "parts must be one or more of sizes, simulation, training, latency, found ['speed']",
+            "parts must be one or more values, each one of sizes, simulation, training, latency, found ['speed']",
         ),
         ("at_scale=huge", "at_scale must be one of cpu, paper, found 'huge'"),
         ("sizes_of=some", "sizes_of must be all or a list of experiments, found 'some'"),

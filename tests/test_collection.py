@@ -185,7 +185,7 @@ def test_the_seeds_of_the_band_can_run_out(played, tmp_path):
     ("key", "value"), [("episodes", 0), ("first_seed", 10_000), ("camera_every", 0), ("workers", -1)]
 )
 def test_mistakes_are_named(key, value, tmp_path):
-    with pytest.raises(UserError, match=f"demos.{key}"):
+    with pytest.raises(UserError, match=f"^{key} must be "):
         collect(TASK, OBSERVATION, demos(tmp_path, **{key: value}))
 
 

@@ -15,6 +15,7 @@ from imfvla.evaluation import evaluate
 from imfvla.nn.residual import AttentionResidual
 from imfvla.options import build
 from imfvla.policy import build_policy
+from imfvla.protocol import EvaluationOptions
 from imfvla.recording import Recordings
 from imfvla.reporting.mapping import read_mapping
 from imfvla.run_directory import RunDirectory
@@ -116,15 +117,8 @@ def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, 
     nfe = config["evaluation"]["nfe"][-1]
     assert torch.equal(policy.predict(obs, noise, nfe), policy.predict(obs, noise, nfe))
 
-    (summary,) = evaluate(
-        run,
-        episodes=1,
-        first_seed=0,
-        nfe=config["evaluation"]["nfe"][:1],
-        workers=0,
-        max_steps=2,
-        recordings=False,
-    )
+    few = {"episodes": 1, "first_seed": 0, "workers": 0, "max_steps": 2, "recordings": False}
+    (summary,) = evaluate(run, EvaluationOptions(nfe=(config["evaluation"]["nfe"][0],), **few))
     assert summary["checkpoint_step"] == 2
     assert not any(summary["failures"].values())
 

@@ -13,6 +13,7 @@ from imfvla import workbench
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
 from imfvla.evaluation import best_median_worst, evaluate
+from imfvla.protocol import EvaluationOptions
 from imfvla.reporting.metrics import TIMING
 from imfvla.rollout_log import PARTIAL
 from imfvla.run_directory import RunDirectory
@@ -43,10 +44,9 @@ def fresh_workbench():
 
 
 def roll(run: RunDirectory, **options) -> list[dict]:
-    defaults = {
-        "episodes": 6, "first_seed": 100_000, "nfe": [1], "workers": 0, "recordings": False, "build": build_fakes,
-    }  # fmt: skip
-    return evaluate(run, **{**defaults, **options})
+    defaults = {"episodes": 6, "first_seed": 100_000, "nfe": (1,), "workers": 0, "recordings": False}
+    make = options.pop("build", build_fakes)
+    return evaluate(run, EvaluationOptions(**{**defaults, **options}), build=make)
 
 
 def untimed_lines(folder: Path) -> list[str]:
@@ -74,9 +74,9 @@ def test_rows_and_summary(run):
 
 
 def test_equal_seeds_give_equal_bytes_but_for_the_times(run, tmp_path):
-    roll(run, nfe=[1, 2])
+    roll(run, nfe=(1, 2))
     first = {name: untimed_lines(run.rollouts(name)) for name in (NAME, "seeds100000-100005_nfe2")}
-    roll(run, nfe=[2, 1], overwrite=True)
+    roll(run, nfe=(2, 1), overwrite=True)
     assert first == {name: untimed_lines(run.rollouts(name)) for name in first}
 
 
@@ -174,9 +174,9 @@ def test_a_wrong_nfe_is_named(value):
         ([], "evaluate needs the directory of a training run: run="),
         (["run={tmp}/nothing"], "is not a run directory: config.yaml is missing"),
         (["run={run}", "nfe=1,0"], "nfe must be one or more whole numbers"),
-        (["run={run}", "episodes=0"], "episodes must be at least 1, found 0"),
+        (["run={run}", "episodes=0"], "episodes must be between 1 and 1000000, found 0"),
         (["run={run}", "episodes=many"], "episodes must be a whole number, found 'many'"),
-        (["run={run}", "device=gpu"], "device must be cpu or cuda, found 'gpu'"),
+        (["run={run}", "device=gpu"], "device must be one of cpu, cuda, found 'gpu'"),
         (["run={run}", "checkpoint=15"], "has no weights of step 15: kept are 10, 20, or take last"),
         (["run={run}", "episode=3"], "Unknown key episode (did you mean episodes?)"),
     ],
@@ -226,7 +226,7 @@ def test_an_evaluation_from_before_noise_had_a_scale_is_not_repeated(run):
 @pytest.mark.parametrize("workers", [0, 1])
 def test_weights_that_are_no_tensors_are_named_and_nothing_is_left_behind(run, workers):
     with pytest.raises(UserError, match="lacks the key 'horizon'"):
-        evaluate(run, episodes=1, first_seed=0, nfe=[1], workers=workers, build=load_policy_alone)
+        roll(run, episodes=1, first_seed=0, workers=workers, build=load_policy_alone)
     assert not list(run.path.glob("rollouts/*"))
 
 

@@ -35,11 +35,12 @@ def calls(synthetic_demonstrations, monkeypatch):
         seen.append(("collect",))
         return Recordings.of(synthetic_demonstrations)
 
-    def evaluate(run, **options):
+    def evaluate(run, options):
         seen.append(("evaluate", options))
 
     monkeypatch.setattr(experiment, "ensure_demonstrations", collect)
     monkeypatch.setattr(experiment, "evaluate", evaluate)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(experiment, "print_row", lambda run: seen.append(("print",)))
     return seen
 
@@ -48,7 +49,7 @@ def test_does_all_stages_once(calls, tmp_path):
     config, run = compose("train", TINY), RunDirectory(tmp_path / "run")
     run_experiment(config, run)
     assert [name for name, *_ in calls] == ["collect", "evaluate", "print"]
-    assert calls[1][1]["nfe"] == (1, 2, 3)
+    assert calls[1][1].nfe == (1, 2, 3)
     assert run.status()["state"] == DONE
     assert run.config() == config
     assert run.weight_steps() == [2, 4]
@@ -90,7 +91,7 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
     run = RunDirectory(tmp_path)
     run_experiment(compose("train", TINY), run)
     run_experiment(compose("train", [*TINY, "evaluation.episodes=7", "training.log_every=5"]), run)
-    assert calls[-2][1]["episodes"] == 7
+    assert calls[-2][1].episodes == 7
     with pytest.raises(UserError, match=r"another config: seed was 0, is 1\. Choose another name"):
         run_experiment(compose("train", [*TINY, "seed=1"]), run)
     assert run.status()["state"] == DONE
@@ -100,19 +101,39 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
     ("override", "message"),
     [
         ("horizon.exec=64", r"horizon\.exec must not exceed horizon\.pred"),
-        ("training.steps=0", r"training\.steps must be at least 1"),
+        ("training.steps=0", r"training\.steps must be between 1"),
         ("training.steps=many", r"training\.steps must be a whole number, found 'many'"),
         ("training.sharding=full", r"training\.sharding=full needs several processes, found one"),
         ("optim.lr=-1", r"optim\.lr must be above 0"),
         ("evaluation.nfe=fast", r"evaluation\.nfe must be a list"),
-        ("evaluation.nfe=[]", r"evaluation\.nfe must be one or more numbers of evaluations"),
-        ("evaluation.nfe=[1,0]", r"nfe, the number of evaluations .* at least 1, found 0"),
-        ("evaluation.episodes=0", r"evaluation\.episodes must be at least 1"),
+        ("evaluation.nfe=[]", r"evaluation\.nfe must be one or more values, each at least 1"),
+        ("evaluation.nfe=[1,0]", r"evaluation\.nfe must be .* at least 1, found \[1, 0\]"),
+        ("evaluation.episodes=0", r"evaluation\.episodes must be between 1 and"),
         ("core=block_attnres core.residual.block_size=9", r"block_size .* 8 sublayers of the core, found 9"),
         ("generator=act core=act evaluation.nfe=[3]", r"must be 1 with generator=act .*, found 3"),
         ("core=act", r"generator .*ImprovedMeanFlow drives .* core .*ActCore is of the kind"),
         ("generator.parametrisation=x", r"generator\.parametrisation must be data or velocity"),
-        ("seed=-1", r"seed must be a whole number of at least 0"),
+        ("evaluation.device=gpu", r"evaluation\.device must be one of cpu, cuda, found 'gpu'"),
+        ("evaluation.device=cuda", r"evaluation\.device must be cpu, as torch finds no CUDA device"),
+        ("training.device=cuda", r"training\.device is cuda, but torch finds no CUDA device"),
+        ("evaluation.workers=-1", r"evaluation\.workers must be null or between 0 and"),
+        ("evaluation.episode_timeout_s=-1", r"evaluation\.episode_timeout_s must be null or above 0"),
+        ("evaluation.noise_seed=-1", r"evaluation\.noise_seed must be between 0 and"),
+        ("evaluation.first_seed=18446744073709551616", r"evaluation\.first_seed must be between 0 and"),
+        ("evaluation.checkpoint=3", r"checkpoint must be one of the weights .* of the steps 2, 4, found 3"),
+        ("evaluation.checkpoint=half", r"evaluation\.checkpoint must be last, a training step"),
+        ("augmentation.brightness=9", r"augmentation\.brightness must be at most 1"),
+        ("observation.num_views=2", r"observation\.num_views must be the number of views, 3, found 2"),
+        ("observation.views=[]", r"observation\.views must be one or more views"),
+        ("action_dim=8", r"action_dim must be one of 16"),
+        ("task.paraphrases=often", r"task\.paraphrases must be true or false"),
+        ("generator.clip=nan", r"generator\.clip must be a finite number, found nan"),
+        ("generator.boundary_share=2", r"generator\.boundary_share must be between 0 and 1"),
+        ("core.heads=many", r"core\.heads must be a whole number, found 'many'"),
+        ("core.width=1000000000000", r"width must be at most 1000000"),
+        ("generator.adaptive_offset=1e-40 generator.adaptive_power=9", r"generator must be finite, found"),
+        ("~evaluation", r"Missing key evaluation"),
+        ("seed=-1", r"seed must be between 0 and"),
     ],
 )
 def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, override, message):
@@ -120,6 +141,28 @@ def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, overrid
         run_experiment(compose("train", [*TINY, *override.split()]), RunDirectory(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     assert calls == []
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("task.expert.modes=3", r"task\.expert\.modes must be 1, 2 or 4"),
+        ("task.variant=odd", r"task\.variant must be one of easy, default, hard"),
+        ("observation.views=[front,back]", r"There is no view 'back'"),
+        ("demos.workers=-1", r"demos\.workers must be null or between 0"),
+    ],
+)
+def test_demonstrations_that_cannot_be_recorded_are_told_before_too(calls, tmp_path, override, message):
+    with pytest.raises(UserError, match=message):
+        run_experiment(compose("train", [*TINY, override]), RunDirectory(tmp_path / "run"))
+    assert calls == []
+
+
+@pytest.mark.parametrize("checkpoint", ["2", "'2'", "1/2", "last"])
+def test_weights_to_evaluate_are_a_step_a_share_or_the_last(calls, tmp_path, checkpoint):
+    config, run = compose("train", [*TINY, f"evaluation.checkpoint={checkpoint}"]), RunDirectory(tmp_path)
+    run_experiment(config, run)
+    assert run.weights_step(calls[1][1].checkpoint) == (4 if checkpoint == "last" else 2)
 
 
 def test_failure_is_in_the_status(calls, tmp_path, monkeypatch):

@@ -48,7 +48,7 @@ def targets(fuzz, tmp_path_factory):
 
 READERS = (
     "mcap", "mcap_index", "state", "weights", "pretrained", "config", "status", "summary", "episodes", "partial",
-    "metrics", "curve", "depth_attention", "store_meta", "store_array", "tables",
+    "metrics", "curve", "depth_attention", "store_meta", "store_array", "options", "tables",
 )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def test_takes_plain_values():
         ({"pair": [1.0]}, r"group\.pair must be a list of 2 entries"),
         ({"many": [1, "x"]}, r"group\.many\[1\] must be a whole number"),
         ({"many": 3}, r"group\.many must be a list"),
-        ({"limit": "x"}, r"group\.limit must be a whole number"),
+        ({"limit": "x"}, r"group\.limit must be null or a whole number"),
     ],
 )
 def test_names_the_key_that_is_wrong(changes, message):

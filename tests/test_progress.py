@@ -14,14 +14,15 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_lines_have_count_and_time_left(caplog):
+def test_lines_have_a_beginning_count_and_time_left(caplog):
     with caplog.at_level(logging.INFO), Progress("sweep", 4, done=2) as bar:
         bar.advance()
         bar.advance("the last one")
     assert [record.getMessage().split("  ")[:2] for record in caplog.records] == [
-        ["sweep: 4 of 4", "the last one"]
+        ["sweep: 2 of 4"],
+        ["sweep: 4 of 4", "the last one"],
     ]
-    assert caplog.records[0].getMessage().endswith(" s, 0 s left")
+    assert caplog.records[1].getMessage().endswith(" s, 0 s left")
 
 
 def test_a_bar_inside_of_another_shares_its_display_and_leaves_it(monkeypatch):

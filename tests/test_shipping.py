@@ -10,7 +10,7 @@ from imfvla.errors import UserError
 from imfvla.files import write_json
 from imfvla.reporting.metrics import summarise
 from imfvla.run_directory import DONE, RUNNING, RunDirectory
-from imfvla.shipping import ship
+from imfvla.shipping import command_of, ship
 
 EPISODE = {
     "total_reward": 900.0,
@@ -74,6 +74,15 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
     assert (made_by["code"], made_by["seed"]) == ("abc", 3)
     assert made_by["results"]["reported"]["success_episodes"] == 1
+
+
+def test_the_command_has_the_lists_that_the_directory_s_name_shows_without_brackets(tmp_path):
+    run = make_run(tmp_path / "core=standard,encoder.vision.hidden=16,24,seed=3")
+    config = {"name": "a", "seed": 3, "core": {"depth": 2}, "encoder": {"vision": {"hidden": [16, 24]}}}
+    assert command_of(run, config) == (
+        "python -m imfvla.train +exp=a core=standard 'encoder.vision.hidden=[16,24]' seed=3"
+    )
+    assert command_of(RunDirectory(tmp_path / "default"), config) == "python -m imfvla.train +exp=a"
 
 
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):

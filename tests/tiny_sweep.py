@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -72,7 +72,12 @@ def main(config: dict[str, Any]) -> None:
         mock.patch.object(
             experiment, "ensure_demonstrations", lambda config: Recordings.of(config["demos"]["directory"])
         ),
-        mock.patch.object(experiment, "evaluate", partial(evaluate, build=build, recordings=False)),
+        mock.patch.object(
+            experiment,
+            "evaluate",
+            lambda run, options: evaluate(run, replace(options, recordings=False), build=build),
+        ),
+        mock.patch.object(experiment, "check_demonstrations"),
         mock.patch.object(experiment.Trainer, "_update", noted),
     ):
         experiment.run_experiment(config, RunDirectory(output_directory()))

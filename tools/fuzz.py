@@ -4,10 +4,11 @@ python tools/fuzz.py                            # 20,000 files over all readers
 python tools/fuzz.py --files 200 --only mcap    # fewer, of one reader
 python tools/fuzz.py --only summary --seed 17 --files 1      # a finding again
 
-The readers are those of everything that somebody else may have written: recordings, checkpoints, configs, results. A
-file is flipped, cut, spliced and stretched as bytes; JSON is changed as values too, and messages of a recording inside
-checksums that fit. Prints a line for each reader and exits with 1 where anything but a UserError came out, a file took
-longer than it may, or memory grew beyond its bound.
+The readers are those of everything that somebody else may have written: recordings, checkpoints, configs, results, and
+the options of a training, which are checked before its first stage. A file is flipped, cut, spliced and stretched as
+bytes; JSON is changed as values too, and messages of a recording inside checksums that fit. Prints a line for each
+reader and exits with 1 where anything but a UserError came out, a file took longer than it may, or memory grew beyond
+its bound.
 """
 
 from imfvla.command import as_command, begin
@@ -37,12 +38,14 @@ from mcap.records import Attachment, Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from imfvla.composition import compose
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
 from imfvla.files import write_json
 from imfvla.nn.pretrained import read_weights
 from imfvla.recording import Recordings, read_episode, read_index
+from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.mapping import read_mapping
@@ -57,6 +60,13 @@ sys.path.insert(0, str(ROOT / "tests"))  # the files to damage are those of the 
 from synthetic import write_demonstrations, write_episode  # noqa: E402
 from synthetic_runs import make_run, write_evaluation  # noqa: E402
 
+TINY = (
+    "observation.image_size=[32,32]",
+    "size.width=32",
+    "size.heads=2",
+    "size.depth=1",
+    "evaluation.nfe=[1]",
+)
 MAX_SECONDS = 5.0  # of one file, of processor time: other work on the machine does not count
 MAX_GROWTH_BYTES = 3 * 2**30  # of memory: what readers allow an episode to unpack to, and room
 SIZES = (0, 1, 2, 127, 128, 255, 256, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63, 2**64 - 1)
@@ -177,6 +187,17 @@ def mutate_json(data: bytes, rng: random.Random) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
+def mutate_one_value(data: bytes, rng: random.Random) -> bytes:
+    """A value of JSON that stays JSON: what a command line may say."""
+    return json.dumps(mutate_value(json.loads(data), rng)).encode()
+
+
+def check_options(path: Path) -> None:
+    """What `imfvla.train` checks before its first stage, in a config that is whole JSON."""
+    config = json.loads(path.read_bytes())
+    rehearse(config, read_options(config).evaluation.nfe)
+
+
 def mutate_yaml(data: bytes, rng: random.Random) -> bytes:
     """Bytes, or pieces of YAML that are meant to hurt, in place of a line."""
     if rng.random() < 0.6:
@@ -273,6 +294,8 @@ def make_targets(folder: Path) -> dict[str, Target]:
     store = folder / "store"
     demos = write_demonstrations(folder / "demos", num_episodes=2, num_steps=4)
     FrameStore.build(Recordings.of(demos), store, (16, 16), ("front",))
+    options = folder / "options.json"
+    write_json(options, compose("train", TINY))
     tables = folder / "tables.yaml"
     tables.write_bytes((ROOT / "experiments" / "tables.yaml").read_bytes())
 
@@ -303,6 +326,7 @@ def make_targets(folder: Path) -> dict[str, Target]:
         "depth_attention": (depth, lambda path: read_depth_attention(path.parent), mutate_json),
         "store_meta": (store / "meta.json", lambda path: FrameStore.open(path.parent), mutate_json),
         "store_array": (store / "state.npy", lambda path: FrameStore.open(path.parent), mutate_bytes),
+        "options": (options, check_options, mutate_one_value),
         "tables": (tables, read_mapping.__wrapped__, mutate_yaml),
     }
     return {name: Target(*reader) for name, reader in readers.items()}

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from imfvla.benchmarks.flops import count_flops, training_flops
-from imfvla.instruction import MAX_WORDS
-from imfvla.policy import Policy, build_policy
+from imfvla.policy import Policy
+from imfvla.rehearsal import blank_observation, build_unfitted
 from imfvla.types import Batch, Observation
 
 
@@ -32,26 +32,6 @@ def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any
         "chunk_gflop": {f"infer{n}": (encoder + n * core) / 1e9 for n in nfe},
         "training_gflop_per_sample": training_flops(policy, Batch(observation, noise, valid), "fp32") / 1e9,
     }
-
-
-def build_unfitted(config: Mapping[str, Any]) -> Policy:
-    """The policy of a composed config with normalisers that change nothing, where only its costs matter."""
-    policy = build_policy(config)
-    states = torch.ones(config["state_dim"])
-    policy.encoder.fit(-states, states)
-    chunk = torch.zeros(policy.noise_shape)
-    policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
-    return policy
-
-
-def blank_observation(config: Mapping[str, Any]) -> Observation:
-    """Black pictures, zeros as the state and an empty sentence, of batch 1."""
-    steps, seen = config["horizon"]["obs"], config["observation"]
-    return Observation(
-        images=torch.zeros(1, steps, seen["num_views"], 3, *seen["image_size"], dtype=torch.uint8),
-        state=torch.zeros(1, steps, config["state_dim"]),
-        instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
-    )
 
 
 def core_inputs(policy: Policy, observation: Observation, noise: Tensor) -> tuple[Any, ...]:

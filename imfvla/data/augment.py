@@ -13,6 +13,7 @@ from imfvla.errors import UserError
 
 FRACTION_BITS = 7  # gains are multiples of 1/128
 MAX_GAIN = 1.98  # keeps (pixel - 128) * gain and its rounding within int16
+MAX_SHIFT_PX = 1000
 BLOCK = 4  # samples at a time: their int16 copies stay in the second-level cache
 
 
@@ -33,7 +34,10 @@ class Augmentation:
     def __post_init__(self) -> None:
         for name in ("shift_px", "brightness", "contrast", "color"):
             if getattr(self, name) < 0:
-                raise UserError(f"augmentation {name} must not be negative, found {getattr(self, name)}.")
+                raise UserError(f"augmentation.{name} must not be negative, found {getattr(self, name)}.")
+        for name, limit in (("shift_px", MAX_SHIFT_PX), ("brightness", 1)):
+            if getattr(self, name) > limit:
+                raise UserError(f"augmentation.{name} must be at most {limit}, found {getattr(self, name)}.")
         if (gain := (1 + self.contrast) * (1 + self.color)) > MAX_GAIN:
             raise UserError(
                 f"augmentation (1 + contrast) * (1 + color) must stay below {MAX_GAIN}, found {gain:.3g}; "

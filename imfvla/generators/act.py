@@ -6,12 +6,13 @@ decoded from it, plus the divergence of the style from N(0, 1). In a rollout the
 Shapes: B batch, H steps, A action, Z style width.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 
 from imfvla.generators.base import masked_mean, refuse_nfe
+from imfvla.options import above, at_least
 
 
 class ActionChunking:
@@ -23,7 +24,7 @@ class ActionChunking:
 
     core_interface = "style"
 
-    def __init__(self, *, kl_weight: float, clip: float) -> None:
+    def __init__(self, *, kl_weight: Annotated[float, at_least(0)], clip: Annotated[float, above(0)]) -> None:
         self.kl_weight = kl_weight
         self.clip = clip
 

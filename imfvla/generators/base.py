@@ -5,12 +5,13 @@ Shapes: B batch, H steps, A action.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
+from imfvla.options import above, at_least, within
 
 
 class Generator(Protocol):
@@ -46,7 +47,7 @@ class UniformTimes:
 class BetaTimes:
     """t = 1 - span (1 - B), B ~ Beta(alpha, 1), drawn as U^(1/alpha) (SmolVLA, arXiv 2506.01844: 1.5 and 0.999)."""
 
-    def __init__(self, alpha: float, span: float) -> None:
+    def __init__(self, alpha: Annotated[float, above(0)], span: Annotated[float, within(0, 1)]) -> None:
         self.alpha, self.span = alpha, span
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
@@ -56,7 +57,7 @@ class BetaTimes:
 class LogitNormalTimes:
     """t = sigmoid(mean + std n), n ~ N(0, 1) (arXiv 2505.13447)."""
 
-    def __init__(self, mean: float, std: float) -> None:
+    def __init__(self, mean: float, std: Annotated[float, at_least(0)]) -> None:
         self.mean, self.std = mean, std
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
@@ -69,7 +70,9 @@ class HighNoiseTimes:
     At low noise a network can copy the action from its input and learns nothing from the pictures.
     """
 
-    def __init__(self, span: float = 0.98, power: float = 2.0) -> None:
+    def __init__(
+        self, span: Annotated[float, within(0, 1)] = 0.98, power: Annotated[float, above(0)] = 2.0
+    ) -> None:
         self.span, self.power = span, power
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:

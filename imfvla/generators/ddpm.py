@@ -12,7 +12,7 @@ Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 
 import hashlib
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from imfvla.errors import UserError
 from imfvla.generators.base import masked_error, refuse_nfe
+from imfvla.options import above
 
 MAX_BETA = 0.999
 
@@ -69,7 +70,7 @@ class DenoisingDiffusion:
         prediction: Literal["epsilon", "sample", "v"],
         clip_sample: bool,
         draws: int,
-        clip: float,
+        clip: Annotated[float, above(0)],
     ) -> None:
         if prediction not in ("epsilon", "sample", "v"):
             raise UserError(f"generator.prediction must be epsilon, sample or v, found {prediction!r}.")

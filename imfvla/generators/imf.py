@@ -11,7 +11,7 @@ pass", arXiv 2608.16153). It is the boundary case u(z_t, t, t), or the output of
 Shapes: B batch, N draws per observation, H steps, A action.
 """
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from imfvla.errors import UserError
 from imfvla.generators.base import masked_error
 from imfvla.generators.velocity import AverageVelocity, interpolate
+from imfvla.options import at_least
 
 
 class ImprovedMeanFlow(AverageVelocity):
@@ -35,7 +36,7 @@ class ImprovedMeanFlow(AverageVelocity):
         self,
         *,
         v_from: Literal["boundary", "head"],
-        instant_weight: float,
+        instant_weight: Annotated[float, at_least(0)],
         compound_target: Literal["sample", "network"],
         **options: Any,
     ) -> None:

@@ -3,12 +3,13 @@
 Shapes: B batch, H steps, A action.
 """
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 
 from imfvla.generators.base import masked_mean, refuse_nfe
+from imfvla.options import above
 
 
 class Regression:
@@ -19,7 +20,7 @@ class Regression:
 
     core_interface = "flow"
 
-    def __init__(self, *, clip: float) -> None:
+    def __init__(self, *, clip: Annotated[float, above(0)]) -> None:
         self.clip = clip
 
     def predict(self, core: nn.Module, context: Any, like: Tensor) -> Tensor:

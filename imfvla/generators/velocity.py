@@ -4,7 +4,7 @@ Shapes: B batch, N draws per observation, H steps, A action.
 """
 
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from imfvla.errors import UserError
 from imfvla.generators.base import TimeSampler, refuse_nfe
 from imfvla.nn.forward_mode import jvp
+from imfvla.options import above, at_least, within
 
 MIN_TIME = 0.02  # u = (z - D) / t: in training the division stops below this time
 
@@ -39,11 +40,11 @@ class LinearPath:
         *,
         parametrisation: Literal["data", "velocity"],
         times: TimeSampler,
-        time_power: float,
-        adaptive_power: float,
-        adaptive_offset: float,
+        time_power: Annotated[float, at_least(0)],
+        adaptive_power: Annotated[float, at_least(0)],
+        adaptive_offset: Annotated[float, above(0)],
         draws: int,
-        clip: float,
+        clip: Annotated[float, above(0)],
     ) -> None:
         if parametrisation not in ("data", "velocity"):
             raise UserError(f"generator.parametrisation must be data or velocity, found {parametrisation!r}.")
@@ -108,7 +109,14 @@ class AverageVelocity(LinearPath):
     The rest as in `LinearPath`.
     """
 
-    def __init__(self, *, boundary_share: float, draws: int, compound_draws: int, **options: Any) -> None:
+    def __init__(
+        self,
+        *,
+        boundary_share: Annotated[float, within(0, 1)],
+        draws: int,
+        compound_draws: int,
+        **options: Any,
+    ) -> None:
         super().__init__(draws=draws, **options)
         if not 1 <= compound_draws <= draws:
             raise UserError(

@@ -5,10 +5,13 @@ After arXiv 2304.13705: post-norm layers with ReLU and dropout; the style is one
 Shapes: B batch, L context tokens, H steps, A channels, D width, Z style width.
 """
 
+from typing import Annotated
+
 import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
+from imfvla.options import above, at_least, within
 
 
 class ActCore(nn.Module):
@@ -24,17 +27,17 @@ class ActCore(nn.Module):
     def __init__(
         self,
         *,
-        steps: int,
-        channels: int,
-        width: int,
-        heads: int,
-        depth: int,
-        decoder_depth: int,
-        style_depth: int,
-        style_width: int,
+        steps: Annotated[int, at_least(1)],
+        channels: Annotated[int, at_least(1)],
+        width: Annotated[int, at_least(1)],
+        heads: Annotated[int, at_least(1)],
+        depth: Annotated[int, at_least(1)],
+        decoder_depth: Annotated[int, at_least(1)],
+        style_depth: Annotated[int, at_least(1)],
+        style_width: Annotated[int, at_least(1)],
         state_token: int,
-        mlp_ratio: float,
-        dropout: float,
+        mlp_ratio: Annotated[float, above(0)],
+        dropout: Annotated[float, within(0, 1)],
     ) -> None:
         super().__init__()
         if width % heads:

@@ -7,6 +7,8 @@ odd layers look those of the prefix up through projections of their own.
 Shapes: B batch, L context tokens, H steps, A channels, D width of the prefix, X width of the expert.
 """
 
+from typing import Annotated
+
 import torch
 from torch import Tensor, nn
 
@@ -16,6 +18,7 @@ from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.pretrained import Backbone
 from imfvla.nn.transformer import Conditioning, SwiGLU
+from imfvla.options import above, at_least
 
 
 class PrefixLayer(nn.Module):
@@ -125,14 +128,14 @@ class SmolVLACore(Backbone, nn.Module):
     def __init__(
         self,
         *,
-        steps: int,
-        channels: int,
-        width: int,
-        expert_width: int,
-        depth: int,
-        heads: int,
-        mlp_ratio: float,
-        max_rad: float,
+        steps: Annotated[int, at_least(1)],
+        channels: Annotated[int, at_least(1)],
+        width: Annotated[int, at_least(1)],
+        expert_width: Annotated[int, at_least(1)],
+        depth: Annotated[int, at_least(1)],
+        heads: Annotated[int, at_least(1)],
+        mlp_ratio: Annotated[float, above(0)],
+        max_rad: Annotated[float, above(0)],
         pretrained: str | None,
         frozen: bool,
     ) -> None:

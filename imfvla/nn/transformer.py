@@ -14,6 +14,7 @@ Shapes: B batch, H steps, A channels, K = H / patch tokens, L context tokens, D 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,7 @@ from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.residual import History
+from imfvla.options import above, at_least
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,14 +98,14 @@ class TransformerCore(nn.Module):
     def __init__(
         self,
         *,
-        steps: int,
-        channels: int,
-        width: int,
-        depth: int,
-        heads: int,
-        patch: int,
-        mlp_ratio: float,
-        max_rad: float,
+        steps: Annotated[int, at_least(1)],
+        channels: Annotated[int, at_least(1)],
+        width: Annotated[int, at_least(1)],
+        depth: Annotated[int, at_least(1)],
+        heads: Annotated[int, at_least(1)],
+        patch: Annotated[int, at_least(1)],
+        mlp_ratio: Annotated[float, above(0)],
+        max_rad: Annotated[float, above(0)],
         residual: Callable[[int, int], nn.Module],
         velocity_head: bool = False,
     ) -> None:

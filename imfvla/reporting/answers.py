@@ -164,6 +164,8 @@ def read_evaluated(evaluation: Evaluation) -> Evaluated:
     path = evaluation.folder / "episodes.jsonl"
     episodes = read_episodes(path, evaluation.seeds)
     for key, value in summarise(episodes).items():
+        if key not in evaluation.summary:
+            continue  # a metric that was added after the evaluation was made
         told = evaluation.summary[key]
         if not _equal(told, value):
             raise UserError(

@@ -20,7 +20,7 @@ from imfvla.reporting.paper import (
     paper_comparisons,
     paper_rows,
 )
-from imfvla.run_directory import LAST, share_of
+from imfvla.run_directory import LAST, step_of
 
 PATH = Path(__file__).resolve().parents[2] / "experiments" / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
@@ -65,7 +65,7 @@ class TableRow:
 
     def step(self, steps: int) -> int:
         """The step of the row's weights in a training of so many steps."""
-        return share_of(steps, self.checkpoint)
+        return step_of(steps, self.checkpoint)
 
 
 @dataclass(frozen=True, slots=True)

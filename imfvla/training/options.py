@@ -1,58 +1,42 @@
 """The `training` and `optim` groups of the config as checked values."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from imfvla.options import require
+from imfvla.options import Limit, above, at_least, one_of, require, within
 from imfvla.training.sharding import SHARDINGS
+
+# Far beyond what is of use: what is larger is a typing error, and would fail late.
+MAX_STEPS, MAX_BATCH, MAX_CHECKPOINTS, MAX_PREFETCH, MAX_THREADS = 10**9, 10**6, 10**4, 1024, 1024
+SHARE_BELOW_1 = Limit("in [0, 1)", lambda value: 0 <= value < 1)
 
 
 @dataclass(frozen=True, slots=True)
 class TrainingOptions:
     """How long and how a policy is trained. Raises UserError on values out of range."""
 
-    steps: int
-    batch_size: int
-    log_every: int  # steps between rows of metrics
-    save_every_s: float  # seconds between states to resume from; 0 saves after each step
-    checkpoints: int  # weights kept, evenly spaced, the last one at the end
-    prefetch: int  # batches prepared ahead
-    precision: str  # fp32 | bf16 | auto
+    steps: Annotated[int, within(1, MAX_STEPS)]
+    batch_size: Annotated[int, within(1, MAX_BATCH)]
+    log_every: Annotated[int, at_least(1)]  # steps between rows of metrics
+    save_every_s: Annotated[
+        float, at_least(0)
+    ]  # seconds between states to resume from; 0 saves after each step
+    checkpoints: Annotated[
+        int, within(1, MAX_CHECKPOINTS)
+    ]  # weights kept, evenly spaced, the last one at the end
+    prefetch: Annotated[int, within(1, MAX_PREFETCH)]  # batches prepared ahead
+    precision: Annotated[str, one_of("fp32", "bf16", "auto")]
     compile: bool
-    device: str  # cpu | cuda | auto
-    threads: int | None  # OpenMP threads of a process, None for its share of the physical cores
-    sharding: str  # none | full: whether each of several processes holds all of the policy or its part
-    on_non_finite: str  # stop | skip: at a batch whose loss or gradient is not finite
+    device: Annotated[str, one_of("cpu", "cuda", "auto")]
+    threads: (
+        Annotated[int, within(1, MAX_THREADS)] | None
+    )  # OpenMP's of a process, None for its share of the cores
+    sharding: Annotated[str, one_of(*SHARDINGS)]  # whether each of several processes holds all of the policy
+    on_non_finite: Annotated[str, one_of("stop", "skip")]  # at a batch whose loss or gradient is not finite
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "log_every", "checkpoints", "prefetch"):
-            require(getattr(self, name) >= 1, f"training.{name}", "at least 1", getattr(self, name))
         require(
             self.checkpoints <= self.steps, "training.checkpoints", f"at most {self.steps}", self.checkpoints
-        )
-        require(self.save_every_s >= 0, "training.save_every_s", "at least 0", self.save_every_s)
-        precisions = ("fp32", "bf16", "auto")
-        require(
-            self.precision in precisions,
-            "training.precision",
-            "one of " + ", ".join(precisions),
-            self.precision,
-        )
-        devices = ("cpu", "cuda", "auto")
-        require(self.device in devices, "training.device", "one of " + ", ".join(devices), self.device)
-        require(
-            self.sharding in SHARDINGS,
-            "training.sharding",
-            "one of " + ", ".join(SHARDINGS),
-            self.sharding,
-        )
-        require(
-            self.on_non_finite in ("stop", "skip"),
-            "training.on_non_finite",
-            "stop or skip",
-            self.on_non_finite,
-        )
-        require(
-            self.threads is None or self.threads >= 1, "training.threads", "null or at least 1", self.threads
         )
 
     def checkpoint_steps(self) -> frozenset[int]:
@@ -66,20 +50,11 @@ class TrainingOptions:
 class OptimOptions:
     """AdamW, its schedule, clipping, the average of the weights. Raises UserError on values out of range."""
 
-    lr: float
-    betas: tuple[float, float]
-    eps: float
-    weight_decay: float
-    warmup: float  # share of the steps
-    floor: float  # share of `lr` at the end
-    clip_norm: float
-    ema_decay: float
-
-    def __post_init__(self) -> None:
-        for name in ("lr", "eps", "clip_norm"):
-            require(getattr(self, name) > 0, f"optim.{name}", "above 0", getattr(self, name))
-        require(self.weight_decay >= 0, "optim.weight_decay", "at least 0", self.weight_decay)
-        require(all(0 <= beta < 1 for beta in self.betas), "optim.betas", "two numbers in [0, 1)", self.betas)
-        for name in ("warmup", "floor"):
-            require(0 <= getattr(self, name) <= 1, f"optim.{name}", "between 0 and 1", getattr(self, name))
-        require(0 <= self.ema_decay < 1, "optim.ema_decay", "in [0, 1)", self.ema_decay)
+    lr: Annotated[float, above(0)]
+    betas: tuple[Annotated[float, SHARE_BELOW_1], Annotated[float, SHARE_BELOW_1]]
+    eps: Annotated[float, above(0)]
+    weight_decay: Annotated[float, at_least(0)]
+    warmup: Annotated[float, within(0, 1)]  # share of the steps
+    floor: Annotated[float, within(0, 1)]  # share of `lr` at the end
+    clip_norm: Annotated[float, above(0)]
+    ema_decay: Annotated[float, SHARE_BELOW_1]

@@ -1,26 +1,28 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from tiny_policy import OPTIM, OPTIONS
 
 from imfvla.errors import UserError
+from imfvla.options import build
+from imfvla.training.options import OptimOptions, TrainingOptions
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"steps": 0}, r"training\.steps must be at least 1, found 0"),
+        ({"steps": 0}, r"training\.steps must be between 1 and 1000000000, found 0"),
         ({"checkpoints": 5}, r"training\.checkpoints must be at most 4"),
         ({"precision": "fp16"}, r"training\.precision must be one of fp32, bf16, auto, found 'fp16'"),
         ({"device": "tpu"}, r"training\.device"),
-        ({"threads": 0}, r"training\.threads must be null or at least 1"),
+        ({"threads": 0}, r"training\.threads must be null or between 1 and 1024"),
         ({"sharding": "half"}, r"training\.sharding must be one of none, full, found 'half'"),
         ({"save_every_s": -1.0}, r"training\.save_every_s"),
     ],
 )
 def test_training_out_of_range(changes, message):
     with pytest.raises(UserError, match=message):
-        replace(OPTIONS, **changes)
+        build(TrainingOptions, asdict(OPTIONS) | changes, "training")
 
 
 @pytest.mark.parametrize(
@@ -34,7 +36,7 @@ def test_training_out_of_range(changes, message):
 )
 def test_optim_out_of_range(changes, message):
     with pytest.raises(UserError, match=message):
-        replace(OPTIM, **changes)
+        build(OptimOptions, asdict(OPTIM) | changes, "optim")
 
 
 @pytest.mark.parametrize(("steps", "count"), [(4, 2), (7, 3), (5, 5), (1, 1)])

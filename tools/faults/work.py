@@ -12,6 +12,7 @@ from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 from imfvla import collection, workbench
 from imfvla.episode import Decision
 from imfvla.evaluation import evaluate
+from imfvla.protocol import EvaluationOptions
 from imfvla.run_directory import RunDirectory
 from imfvla.training.loop import Trainer
 
@@ -33,7 +34,8 @@ def roll_out(folder: Path, episodes: int) -> None:
     config = {"name": "chaos", "task": {"name": "fake", "variant": "default"}, "observation": observation}
     (folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     workbench._bench.cache_clear()
-    evaluate(run, episodes=episodes, first_seed=100_000, nfe=[1], workers=0, build=build_fakes)
+    options = EvaluationOptions(episodes=episodes, first_seed=100_000, nfe=(1,), workers=0)
+    evaluate(run, options, build=build_fakes)
 
 
 class Demonstrator:

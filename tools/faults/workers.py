@@ -13,6 +13,7 @@ from fakes import build_fakes
 from faults.outcome import Differs, compare, rows_of
 from faults.work import roll_out
 from imfvla.evaluation import evaluate
+from imfvla.protocol import EvaluationOptions
 from imfvla.run_directory import RunDirectory
 
 
@@ -42,8 +43,8 @@ def workers(folder: Path, kills: int, rng: random.Random) -> str:
     roll_out(folder / "faulty", 8)
     (rollouts,) = (folder / "faulty" / "rollouts").iterdir()
     subprocess.run(["rm", "-rf", str(rollouts)], check=True)
-    options = {"episodes": 8, "first_seed": 100_000, "nfe": [1], "workers": 1, "episode_timeout_s": 60.0}
-    (summary,) = evaluate(RunDirectory(folder / "faulty"), build=die_or_hang_once, **options)
+    options = EvaluationOptions(episodes=8, first_seed=100_000, nfe=(1,), workers=1, episode_timeout_s=60.0)
+    (summary,) = evaluate(RunDirectory(folder / "faulty"), options, build=die_or_hang_once)
     equal = compare(rows_of(folder / "faulty"), rows_of(folder / "whole"))
     if summary["worker_incidents"] != 2:
         raise Differs(f"worker_incidents is {summary['worker_incidents']}, wanted 2")

@@ -1,0 +1,117 @@
+"""What would end an experiment late, found before its first stage: options out of range, a policy that cannot learn."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+
+from imfvla.chunks import FRAMES
+from imfvla.construction import reason_of
+from imfvla.data import Augmentation
+from imfvla.episode import ACTION_DIM, STATE_DIM
+from imfvla.errors import UserError
+from imfvla.evaluation import require_device
+from imfvla.horizon import Horizon
+from imfvla.instruction import MAX_WORDS
+from imfvla.options import build, one_of, part_of, require, within
+from imfvla.policy import Policy, build_policy
+from imfvla.protocol import MAX_SEED, EvaluationOptions
+from imfvla.run_directory import step_of
+from imfvla.training.loop import choose_device
+from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.types import Batch, Observation
+from imfvla.views import ViewOptions
+
+
+@dataclass(frozen=True, slots=True)
+class Scalars:
+    """The keys of train.yaml that are in no group."""
+
+    name: str
+    seed: Annotated[int, within(0, MAX_SEED)]
+    state_dim: Annotated[int, one_of(STATE_DIM)]
+    action_dim: Annotated[int, one_of(ACTION_DIM)]
+    action_frame: Annotated[str, one_of(*FRAMES)]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentOptions:
+    """The checked groups of train.yaml that training and evaluation read."""
+
+    training: TrainingOptions
+    optim: OptimOptions
+    evaluation: EvaluationOptions
+
+
+def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
+    """The options of all stages but the policy's and the demonstrations'. Raises UserError on the first wrong one."""
+    build(Scalars, {name: part_of(config, name) for name in Scalars.__slots__}, "")
+    build(Horizon, part_of(config, "horizon"), "horizon")
+    build(Augmentation, part_of(config, "augmentation"), "augmentation")
+    seen = {name: part_of(config, f"observation.{name}") for name in ViewOptions.__slots__}
+    views = build(ViewOptions, seen, "observation").views
+    paraphrases = part_of(config, "task.paraphrases")
+    require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
+    count = part_of(config, "observation.num_views")
+    require(count == len(views), "observation.num_views", f"the number of views, {len(views)}", count)
+    training = build(TrainingOptions, part_of(config, "training"), "training")
+    optim = build(OptimOptions, part_of(config, "optim"), "optim")
+    evaluation = build(EvaluationOptions, part_of(config, "evaluation"), "evaluation")
+    choose_device(training.device)
+    require_device(evaluation.device, "evaluation.device")
+    kept = training.checkpoint_steps()
+    require(
+        step_of(training.steps, evaluation.checkpoint) in kept,
+        "evaluation.checkpoint",
+        f"one of the weights that training.steps and training.checkpoints keep, those of the steps "
+        f"{', '.join(map(str, sorted(kept)))}",
+        evaluation.checkpoint,
+    )
+    return ExperimentOptions(training, optim, evaluation)
+
+
+def rehearse(config: Mapping[str, Any], nfe: Sequence[int]) -> Policy:
+    """The configured policy, after a loss and a chunk on black pictures.
+
+    Raises UserError where it cannot be built, cannot compute them, or cannot do with one of the numbers of evaluations.
+    """
+    try:
+        policy = build_unfitted(config).eval()
+        for number in nfe:
+            policy.generator.check_nfe(number)
+        observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
+        valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
+        with torch.no_grad():
+            loss, _ = policy.loss(Batch(observation, noise, valid), torch.Generator().manual_seed(0))
+            chunk = policy.predict(observation, noise, min(nfe))
+    except UserError:
+        raise
+    except Exception as error:  # whatever comes of arguments that a constructor took and that are no use
+        raise UserError(
+            "the configured policy cannot compute a loss and a chunk: correct encoder, core or generator; torch says "
+            f"{reason_of(error)!r}."
+        ) from error
+    is_finite = bool(loss.isfinite() and chunk.isfinite().all())
+    require(is_finite, "the first loss and chunk of encoder, core and generator", "finite", float(loss))
+    return policy
+
+
+def build_unfitted(config: Mapping[str, Any]) -> Policy:
+    """The policy of a composed config with normalisers that change nothing: it computes, though nothing of use."""
+    policy = build_policy(config)
+    states = torch.ones(config["state_dim"])
+    policy.encoder.fit(-states, states)
+    chunk = torch.zeros(policy.noise_shape)
+    policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
+    return policy
+
+
+def blank_observation(config: Mapping[str, Any]) -> Observation:
+    """Black pictures, zeros as the state and an empty sentence, of batch 1."""
+    steps, seen = config["horizon"]["obs"], config["observation"]
+    return Observation(
+        images=torch.zeros(1, steps, seen["num_views"], 3, *seen["image_size"], dtype=torch.uint8),
+        state=torch.zeros(1, steps, config["state_dim"]),
+        instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
+    )
