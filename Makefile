@@ -25,7 +25,7 @@ help:  ## List the targets
 	@printf '\n  ARGS="..." is passed to the command; PYTHON=python3.12 sets the interpreter of $(VENV).\n'
 
 setup: $(INSTALLED)  ## Install into .venv, install a GL library if none renders, check the machine
-	@$(PY) tools/doctor.py --only gl > /dev/null || tools/install_gl.sh
+	@$(PY) tools/doctor.py --only gl > /dev/null || { [ $$? != 2 ] && tools/install_gl.sh $(PY); }
 	@$(PY) tools/doctor.py
 
 train: setup  ## Main job: demonstrations, training, 100 rollouts, the table's row (EXP=socket_ph32_exec16)

@@ -1,83 +1,115 @@
 """Chooses how MuJoCo draws without a screen; must run before mujoco is imported."""
 
-import ctypes
+import json
 import os
-import threading
-from collections.abc import Callable
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
 
 from imfvla.errors import UserError
 
 BACKENDS = ("egl", "osmesa", "glfw", "cgl", "wgl")
-PROBE_TIMEOUT_S = 20.0  # a driver answers within a second, or never
-_REMEDY = (
-    "install one of them, on Debian or Ubuntu: `sudo apt-get install -y libegl1 libgl1-mesa-dri` "
-    "(EGL) or `sudo apt-get install -y libosmesa6` (OSMesa)"
-)
+PROBED = ("egl", "osmesa")  # in the order of preference
+PROBE_TIMEOUT_S = 30.0  # a driver answers within a second, or never
+DEVICE_KEY = "MUJOCO_EGL_DEVICE_ID"
+# Debian's and Ubuntu's packages, for the installer, the messages and the README. EGL comes without the library that
+# has OpenGL's functions, which is libopengl0.
+PACKAGES = {
+    "egl": ("libegl1", "libegl-mesa0", "libgl1-mesa-dri", "libopengl0"),
+    "osmesa": ("libosmesa6",),
+}
+
+
+class WrongSetting(UserError):
+    """An environment variable asks for what is not there; no package helps."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What `gl_probe` found: `problem` is None where the backend draws."""
+
+    devices: int = 0
+    problem: str | None = None
+
+
+def install_command(backend: str = "egl") -> str:
+    """The shell command that installs the libraries of `backend` on Debian and Ubuntu."""
+    packages = " ".join(PACKAGES[backend])
+    return f"sudo apt-get update && sudo apt-get install -y --no-install-recommends {packages}"
 
 
 def select_gl_backend() -> str:
     """Sets MUJOCO_GL, PYOPENGL_PLATFORM and LP_NUM_THREADS for this process and returns the backend's name.
 
-    A MUJOCO_GL that is already set is honoured; otherwise EGL is taken where a device answers, else OSMesa.
+    A MUJOCO_GL that is already set is honoured; otherwise EGL is taken where it draws, else OSMesa.
     Software rendering gains nothing from threads at these image sizes, so llvmpipe gets none.
 
     Raises:
-        UserError: no backend can be loaded, or MUJOCO_GL names an unknown one.
+        WrongSetting: MUJOCO_GL or MUJOCO_EGL_DEVICE_ID has a value that nothing answers to.
+        UserError: no backend draws.
     """
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted and wanted not in BACKENDS:
-        raise UserError(
-            f"MUJOCO_GL must be one of {', '.join(BACKENDS)}, found {wanted!r}; unset it or mend it."
+        raise WrongSetting(
+            f"MUJOCO_GL must be one of {', '.join(BACKENDS)}, found {wanted!r}; unset it or choose one of them."
         )
-    if wanted in _PROBES and not _answers(_PROBES[wanted]):
-        raise UserError(f"MUJOCO_GL={wanted} was asked for, but {wanted} cannot be loaded here; {_REMEDY}.")
-    backend = wanted or next((name for name, probe in _PROBES.items() if _answers(probe)), None)
-    if backend is None:
-        raise UserError(
-            f"MuJoCo needs EGL or OSMesa to render the cameras, but neither can be loaded; {_REMEDY}."
-        )
+    backend = (
+        wanted if wanted and wanted not in PROBED else _first_that_draws((wanted,) if wanted else PROBED)
+    )
     os.environ["MUJOCO_GL"] = backend
-    if backend in _PROBES:
+    if backend in PROBED:
         os.environ["PYOPENGL_PLATFORM"] = backend
     os.environ.setdefault("LP_NUM_THREADS", "0")
     return backend
 
 
-def _answers(probe: Callable[[], bool]) -> bool:
-    """Whether `probe` finds its backend in time; a driver that hangs is one that is not there."""
-    found: list[bool] = []
-    thread = threading.Thread(target=lambda: found.append(probe()), daemon=True)
-    thread.start()
-    thread.join(PROBE_TIMEOUT_S)
-    return found == [True]
+def _first_that_draws(candidates: tuple[str, ...]) -> str:
+    problems = []
+    for backend in candidates:
+        answer = _egl() if backend == "egl" else _probe(backend)
+        if answer.problem is None:
+            return backend
+        problems.append(f"{backend}: {answer.problem}")
+    if len(candidates) == 1:
+        found = f"MUJOCO_GL={candidates[0]} was asked for, but does not draw here"
+    else:
+        found = "MuJoCo needs EGL or OSMesa to render the cameras, but neither draws here"
+    remedy = f"on Debian or Ubuntu, run `{install_command(candidates[0])}`"
+    raise UserError(f"{found} ({'; '.join(problems)}); {remedy}.")
 
 
-def _has_egl() -> bool:
-    """Whether libEGL loads and knows at least one device."""
+def _egl() -> Answer:
+    """The answer of EGL on the device that MUJOCO_EGL_DEVICE_ID names, if any."""
+    device = os.environ.get(DEVICE_KEY)
+    if device is not None and not device.strip():
+        del os.environ[DEVICE_KEY]
+        device = None
+    if device is None:
+        return _probe("egl")
+    if not device.strip().isdecimal():
+        raise WrongSetting(f"{DEVICE_KEY} must be the number of an EGL device, found {device!r}; unset it.")
+    answer = _probe("egl")
+    if answer.devices and int(device) >= answer.devices:
+        raise WrongSetting(
+            f"{DEVICE_KEY} must be in 0 ... {answer.devices - 1}, the EGL devices here, found {device!r}; unset it."
+        )
+    if answer.devices and answer.problem:
+        raise WrongSetting(
+            f"{DEVICE_KEY}={device} does not draw ({answer.problem}); unset it or choose another."
+        )
+    return answer
+
+
+def _probe(backend: str) -> Answer:
+    """Asks `gl_probe` in a process of its own; one that hangs or dies has a backend that does not draw."""
+    program = Path(__file__).with_name("gl_probe.py")
     try:
-        egl = ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return False
-    egl.eglGetProcAddress.restype = ctypes.c_void_p
-    address = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
-    if not address:
-        return False
-    query = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int))(
-        address
-    )
-    count = ctypes.c_int(0)
-    return bool(query(0, None, ctypes.byref(count))) and count.value > 0
-
-
-def _has_osmesa() -> bool:
-    """Whether one of the OSMesa libraries loads."""
-    for name in ("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
-    return False
-
-
-_PROBES = {"egl": _has_egl, "osmesa": _has_osmesa}
+        child = subprocess.run(
+            [sys.executable, "-I", str(program), backend], capture_output=True, timeout=PROBE_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired:
+        return Answer(problem=f"no answer within {PROBE_TIMEOUT_S:g} s")
+    if child.returncode != 0:
+        return Answer(problem=f"its driver died with exit code {child.returncode}")
+    return Answer(**json.loads(child.stdout.splitlines()[-1]))

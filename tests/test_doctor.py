@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from imfvla.gl import PACKAGES, install_command
+
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 
 
@@ -124,12 +126,43 @@ def test_without_rights_the_installer_prints_the_one_command_and_fails(tmp_path)
     fake_program(tmp_path, "apt-get", f"touch {tmp_path}/called")
     path = f"{tmp_path}{os.pathsep}/usr/bin{os.pathsep}/bin"
     installer = subprocess.run(
-        [str(TOOLS / "install_gl.sh")], env={"PATH": path}, capture_output=True, text=True, check=False
+        [str(TOOLS / "install_gl.sh"), sys.executable],
+        env={"PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert installer.returncode == 1
-    assert "sudo apt-get update && sudo apt-get install -y" in installer.stderr
-    assert "libegl1 libegl-mesa0 libgl1-mesa-dri" in installer.stderr
+    assert f"let an administrator run `{install_command()}`" in installer.stderr
     assert not (tmp_path / "called").exists()
+
+
+def test_where_egl_does_not_render_the_installer_goes_over_to_osmesa(tmp_path):
+    asked = tmp_path / "asked"
+    fake_program(tmp_path, "id", "echo 0")
+    fake_program(tmp_path, "apt-get", f'echo "$@" >> {asked}')
+    renders = f"*doctor.py*) grep -q libosmesa6 {asked} ;;"  # as if EGL had no device
+    python = fake_program(tmp_path, "python", f'case "$*" in {renders} *) exec {sys.executable} "$@" ;; esac')
+    path = f"{tmp_path}{os.pathsep}/usr/bin{os.pathsep}/bin"
+    installer = subprocess.run(
+        [str(TOOLS / "install_gl.sh"), str(python)],
+        env={"PATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert installer.returncode == 0, installer.stderr
+    installed = [line.split("--no-upgrade ")[1].split() for line in asked.read_text().splitlines()[1:]]
+    assert installed == [list(PACKAGES["egl"]), list(PACKAGES["osmesa"])]
+    assert "MUJOCO_GL" not in installer.stdout + installer.stderr
+
+
+@pytest.mark.parametrize(("code", "expected"), [(0, ("", 0)), (1, ("installs\n", 0)), (2, ("", 1))])
+def test_make_setup_installs_only_where_an_installation_helps(code, expected):
+    """The doctor's exit code 2 is a wrong environment variable."""
+    recipe = re.search(r"doctor.py --only gl > /dev/null (\|\|.*)", (TOOLS.parent / "Makefile").read_text())
+    command = recipe.group(1).replace("$$", "$").replace("tools/install_gl.sh $(PY)", "echo installs")
+    shell = subprocess.run(["bash", "-c", f"(exit {code}) {command}"], capture_output=True, text=True)
+    assert (shell.stdout, shell.returncode) == expected
 
 
 @pytest.mark.parametrize(

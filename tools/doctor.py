@@ -4,6 +4,8 @@
     python tools/doctor.py                # everything; exit code 1 if a line fails
     python tools/doctor.py --only gl      # one check
 
+An environment variable with a value that nothing answers to ends it with one sentence and exit code 2.
+
 The frame is rendered in a process of its own with a time limit, so that a graphics driver that hangs cannot
 hang the doctor.
 """
@@ -26,21 +28,22 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import metadata
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))  # works before the package is installed, and says then what is missing
+
+from imfvla import gl  # noqa: E402
+from imfvla.errors import UserError  # noqa: E402
+
 MIN_PYTHON = (3, 11)
 MIN_FREE_GB = 5.0  # demonstrations, frame store and one run of a task
 MIN_MEMORY_GIB = 4.0
 RENDER_TIMEOUT_S = 30.0
+EXIT_FAILURE, EXIT_USER_ERROR = 1, 2
 REINSTALL = "touch constraints.txt && make setup"
-GL_BACKENDS = ("egl", "osmesa")
-GL_REMEDY = (
-    "make setup installs a GL library where it may; by hand: sudo apt-get install -y --no-install-recommends "
-    "libegl1 libegl-mesa0 libgl1-mesa-dri"
-)
 # A floor, a ball and a light: enough for a frame that is neither blank nor the same everywhere.
 SCENE = """
 <mujoco>
@@ -127,20 +130,21 @@ def check_packages(constraints: Path = ROOT / "constraints.txt") -> Finding:
 
 def check_gl(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
     """A frame can be rendered: the backend that imfvla chooses, its renderer and the frame's digest."""
+    by_hand = f"make setup installs a GL library where it may; by hand: {gl.install_command()}"
     frame, problem = _render_in_child({}, timeout_s)
     if frame is not None:
         text = "{backend}, {renderer}, frame {digest} in {seconds:.1f} s".format(**frame)
         if not frame["has_content"]:
-            return Finding("gl", f"{text} is blank", f"export MUJOCO_GL=osmesa; or {GL_REMEDY}")
+            return Finding("gl", f"{text} is blank", f"export MUJOCO_GL=osmesa; or {by_hand}")
         return Finding("gl", text)
     chosen = os.environ.get("MUJOCO_GL")
-    for backend in GL_BACKENDS:
+    for backend in gl.PROBED:
         if backend == chosen:
             continue
         frame, _ = _render_in_child({"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}, timeout_s)
         if frame is not None and frame["has_content"]:
             return Finding("gl", f"{problem}; {backend} renders", f"export MUJOCO_GL={backend}")
-    return Finding("gl", problem, REINSTALL if "ModuleNotFoundError" in problem else GL_REMEDY)
+    return Finding("gl", problem, REINSTALL if "ModuleNotFoundError" in problem else by_hand)
 
 
 def check_video() -> Finding:
@@ -185,8 +189,10 @@ def check_repeats(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
     digests = {frame["digest"] for frame in frames if frame is not None}
     steps = {_training_digest() for _ in range(2)}
     threads = torch.get_num_threads()
+    if not digests:
+        return Finding("repeats", "there is no frame to compare", "see the line gl")
     if len(digests) != 1:
-        found = " and ".join(sorted(digests)) or "no frame"
+        found = " and ".join(sorted(digests))
         return Finding("repeats", f"two renderings of one scene: {found}", "export MUJOCO_GL=osmesa")
     if len(steps) != 1:
         text = f"two equal training steps on {threads} threads differ"
@@ -230,10 +236,8 @@ def render_frame() -> dict:
     import hashlib
     import time
 
-    from imfvla.gl import select_gl_backend
-
     start = time.perf_counter()
-    backend = select_gl_backend()
+    backend = gl.select_gl_backend()
     from dm_control import mujoco
     from OpenGL import GL
 
@@ -252,7 +256,7 @@ def render_frame() -> dict:
 
 
 def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dict | None, str]:
-    """The answer of `render_frame` in a process of its own, or None and what went wrong."""
+    """The answer of `render_frame` in a process of its own, or None and what went wrong; raises WrongSetting."""
     command = [sys.executable, str(Path(__file__).resolve()), "--render-frame"]
     try:
         child = subprocess.run(
@@ -267,6 +271,8 @@ def _render_in_child(environment: dict[str, str], timeout_s: float) -> tuple[dic
         return None, f"no frame within {timeout_s:.0f} s: the graphics driver hangs"
     if child.returncode == 0:
         return json.loads(child.stdout.splitlines()[-1]), ""
+    if child.returncode == EXIT_USER_ERROR:
+        raise gl.WrongSetting(child.stderr.strip())
     last = (child.stderr.strip().splitlines() or [f"the renderer died with code {child.returncode}"])[-1]
     return None, f"no frame could be rendered: {last}"
 
@@ -288,16 +294,34 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--render-frame", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.render_frame:
-        print(json.dumps(render_frame()))
-        return 0
+        return _print_frame()
+    try:
+        return _report(options.only or CHECKS)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return EXIT_USER_ERROR
+
+
+def _report(names: Iterable[str]) -> int:
+    """Prints the findings and returns the exit code."""
     num_failed = 0
-    for name in options.only or CHECKS:
+    for name in names:
         finding = run_check(name)
         print(f"{'ok  ' if finding.remedy is None else 'FAIL'}  {finding.name:<9} {finding.text}", flush=True)
         if finding.remedy is not None:
             num_failed += 1
             print(f"      {'':<9} remedy: {finding.remedy}", flush=True)
-    return 1 if num_failed else 0
+    return EXIT_FAILURE if num_failed else 0
+
+
+def _print_frame() -> int:
+    """What the child of `_render_in_child` does: a frame on stdout, or why there is none on stderr."""
+    try:
+        print(json.dumps(render_frame()))
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return EXIT_USER_ERROR if isinstance(error, gl.WrongSetting) else EXIT_FAILURE
+    return 0
 
 
 if __name__ == "__main__":
