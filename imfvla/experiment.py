@@ -14,6 +14,7 @@ from imfvla.collection import check_demonstrations, ensure_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
+from imfvla.gl import select_gl_backend
 from imfvla.nn.pretrained import initialise_from_pretrained
 from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
@@ -45,6 +46,8 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
+    if run.status().get("state") != DONE:
+        select_gl_backend()  # without one, training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
         if not is_trained:
             processes.check(training)

@@ -199,6 +199,16 @@ def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anyth
     assert not run.status()
 
 
+def test_a_device_that_cannot_draw_is_told_before_anything_is_done(calls, tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "GPU-1234")
+    run = RunDirectory(tmp_path / "run")
+    with pytest.raises(UserError, match="MUJOCO_EGL_DEVICE_ID"):
+        run_experiment(compose("train", TINY), run)
+    assert calls == []
+    assert not run.status()
+
+
 def test_pretrained_weights_are_read_where_a_training_begins_and_never_again(calls, tmp_path, monkeypatch):
     read = []
     monkeypatch.setattr(experiment, "initialise_from_pretrained", read.append)
