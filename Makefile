@@ -15,6 +15,7 @@ ARGS ?=
 SHIPPED := experiments/pretrained/$(TASK)_ph32_exec16
 VENV := .venv
 PY := $(VENV)/bin/python
+PIP := $(PY) -m pip --quiet --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 
 .PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations campaign bench tables report gallery test lint clean
@@ -82,5 +83,6 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV) || { \
 	  echo "$(PYTHON) could not create a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
 	  exit 1; }
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(PIP) install ./tools/labmaze; fi
+	$(PIP) install -c constraints.txt -e '.[dev]'
 	@touch $@
