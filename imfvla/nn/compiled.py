@@ -15,14 +15,19 @@ from torch import nn
 from imfvla.errors import UserError
 
 
+def has_compiler() -> bool:
+    """Whether inductor finds a C++ compiler."""
+    return any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++"))
+
+
 def compile_parts(policy: nn.Module, backend: str = "inductor") -> None:
     """Compiles encoder and core of `policy` in place, at the first call for each shape; weights keep their names.
 
     A compiled policy computes what it computed before but for rounding (1e-4 of an action's deviation).
 
-    Raises UserError where the C++ compiler that it needs is missing.
+    Raises UserError where the C++ compiler that inductor needs is missing.
     """
-    if not any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "g++", "clang++")):
+    if backend == "inductor" and not has_compiler():
         raise UserError(
             "compile=true needs a C++ compiler, none found: install g++ or leave policies uncompiled."
         )

@@ -25,6 +25,7 @@ def compiled_copy(made, backend):
     return twin
 
 
+@pytest.mark.skipif(not compiled.has_compiler(), reason="no C++ compiler is installed")
 @torch.inference_mode()
 def test_a_compiled_policy_predicts_what_the_eager_one_does():
     made, data = shallow_policy().eval(), batch()
