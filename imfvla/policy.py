@@ -44,6 +44,11 @@ class Policy(nn.Module):
         """(Tp, A) of the noise that one prediction starts from."""
         return self.horizon.pred, self.action_dim
 
+    def begin_step(self, step: int, steps: int) -> None:
+        """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
+        if hasattr(self.generator, "begin_step"):
+            self.generator.begin_step(self.core, step, steps)
+
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
         actions = self.chunks.normalise(batch.actions, batch.obs.state[:, -1])

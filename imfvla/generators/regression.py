@@ -19,8 +19,8 @@ class Regression:
 
     core_interface = "flow"
 
-    def __init__(self, *, clip: float) -> None:
-        self.clip = clip
+    def __init__(self, *, clip: float, power: int = 1) -> None:
+        self.clip, self.power = clip, power
 
     def predict(self, core: nn.Module, context: Any, like: Tensor) -> Tensor:
         """The core's answer, of the shape of `like` (B, H, A), which is not read."""
@@ -31,7 +31,7 @@ class Regression:
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean absolute error of each chunk (B,); nothing is drawn from `rng`."""
-        error = masked_mean((self.predict(core, context, actions) - actions).abs(), valid)
+        error = masked_mean((self.predict(core, context, actions) - actions).abs() ** self.power, valid)
         return error, {"absolute_error": error.detach().mean()}
 
     def check_nfe(self, nfe: int) -> None:

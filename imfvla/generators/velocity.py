@@ -117,6 +117,12 @@ class AverageVelocity(LinearPath):
         self.boundary_share = boundary_share
         self.compound_draws = compound_draws
 
+    def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
+        """v(z, t), of blocks of its own where the core has them, else u(z, t, t): z (B, H, A), t (B,) -> (B, H, A)."""
+        if self.core_interface == "flow":
+            return self.velocity(core, z, t, t, context)
+        return self.velocity(lambda z, t, r, context: core.instant(z, t, context), z, t, t, context)
+
     def derivative(
         self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
     ) -> tuple[Tensor, Tensor]:

@@ -181,6 +181,8 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
+        for policy in (self.policy, self.ema.policy):
+            policy.begin_step(self.step, self.options.steps)
         with autocast(self.precision, self.device), self.processes.draws(rng, len(share.actions)):
             loss, logs = self.policy.loss(share, rng)
         loss_value, *means = self.processes.mean([loss.item(), *(value.item() for value in logs.values())])
