@@ -23,7 +23,7 @@ def play(env, expert, seed: int) -> tuple[list[int], np.ndarray, list]:
 
 @pytest.mark.parametrize("modes", [1, 2, 4])
 def test_demonstrations_succeed_stage_by_stage(env, modes):
-    expert = make_expert(env.name, modes=modes, noise=0.004, hold=18)
+    expert = make_expert(env.name, modes=modes, noise=0.004, hold=18, dwell=0)
     for seed in (11, 12):
         stages, states, decisions = play(env, expert, seed)
         assert max(stages) == env.success_stage
@@ -45,13 +45,13 @@ def test_demonstrations_succeed_stage_by_stage(env, modes):
 @pytest.mark.parametrize("name", tasks.NAMES)
 def test_other_variants_can_be_solved(name, variant):
     env = tasks.load(name, variant=variant)
-    stages, _, _ = play(env, make_expert(name, modes=2, noise=0.004, hold=18), 3)
+    stages, _, _ = play(env, make_expert(name, modes=2, noise=0.004, hold=18, dwell=0), 3)
     assert max(stages) == env.success_stage
     env.close()
 
 
 def test_the_hidden_mode_is_in_the_style_and_in_nothing_one_could_see(env):
-    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18) for modes in (1, 2))
+    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18, dwell=0) for modes in (1, 2))
     signs = []
     for seed in range(12):
         env.reset(seed)
@@ -71,7 +71,7 @@ def test_the_hidden_mode_is_in_the_style_and_in_nothing_one_could_see(env):
 
 def test_both_ways_of_the_hidden_choice_part_at_once_and_their_mean_is_neither(env):
     """From the same start the right wrist turns a quarter either way."""
-    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18) for modes in (1, 2))
+    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18, dwell=0) for modes in (1, 2))
     seed = 0
     while True:
         env.reset(seed)
@@ -87,7 +87,7 @@ def test_both_ways_of_the_hidden_choice_part_at_once_and_their_mean_is_neither(e
 
 
 def test_four_modes_draw_both_arms(socket_env):
-    expert = make_expert("socket", modes=4, noise=0.0, hold=18)
+    expert = make_expert("socket", modes=4, noise=0.0, hold=18, dwell=0)
     seen = set()
     for seed in range(24):
         socket_env.reset(seed)
@@ -97,7 +97,7 @@ def test_four_modes_draw_both_arms(socket_env):
 
 
 def test_noise_is_executed_and_not_recorded(env):
-    expert = make_expert(env.name, modes=2, noise=0.01, hold=18)
+    expert = make_expert(env.name, modes=2, noise=0.01, hold=18, dwell=0)
     env.reset(0)
     expert.reset(env, 0)
     differences = []
@@ -114,7 +114,7 @@ def test_noise_is_executed_and_not_recorded(env):
 
 def test_a_push_is_corrected(env):
     """Thrown off during the approach, the expert still succeeds: what it does follows from what it measures."""
-    expert = make_expert(env.name, modes=2, noise=0.0, hold=18)
+    expert = make_expert(env.name, modes=2, noise=0.0, hold=18, dwell=0)
     env.reset(2)
     expert.reset(env, 2)
     for step in range(env.time_limit_steps):
@@ -129,12 +129,15 @@ def test_a_push_is_corrected(env):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"name": "knitting", "modes": 2, "noise": 0.0, "hold": 18}, "no expert for a task 'knitting'"),
         (
-            {"name": "socket", "modes": 3, "noise": 0.0, "hold": 18},
+            {"name": "knitting", "modes": 2, "noise": 0.0, "hold": 18, "dwell": 0},
+            "no expert for a task 'knitting'",
+        ),
+        (
+            {"name": "socket", "modes": 3, "noise": 0.0, "hold": 18, "dwell": 0},
             "task.expert.modes must be 1, 2 or 4, found 3",
         ),
-        ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18}, "task.expert.noise"),
+        ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18, "dwell": 0}, "task.expert.noise"),
     ],
 )
 def test_mistakes_are_named(arguments, message):
@@ -144,4 +147,4 @@ def test_mistakes_are_named(arguments, message):
 
 def test_an_expert_refuses_another_task(transfer_env):
     with pytest.raises(UserError, match="expert of 'socket' was given the task 'transfer'"):
-        make_expert("socket", modes=1, noise=0.0, hold=18).reset(transfer_env, 0)
+        make_expert("socket", modes=1, noise=0.0, hold=18, dwell=0).reset(transfer_env, 0)
