@@ -74,7 +74,7 @@ class StagedMeanFlow(AverageVelocity):
         """Loss of each chunk (B,), a mean over its draws."""
         batch = len(actions)
         context, x, noise, valid = self.repeat(context, actions, valid, rng)
-        t = self.times(len(x), rng).to(x)
+        t = self.draw_times(len(x), rng).to(x)
         z, target = interpolate(x, noise, t)
         v = self.instant_velocity(core, z, t, context)
         instant_error = t**self.time_power * masked_error(v - target, valid)
