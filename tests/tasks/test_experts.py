@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
+from imfvla.episode import ACTION_NAMES
 from imfvla.errors import UserError
 from imfvla.tasks.experts import make_expert
+from imfvla.tasks.experts.transfer import TransferExpert
 from imfvla.tasks.robot import JOINT_LIMITS
 
 
@@ -126,6 +128,32 @@ def test_a_push_is_corrected(env):
     assert env.stage() == env.success_stage
 
 
+def test_a_hand_that_dwells_closes_later_by_what_was_drawn_and_does_all_else_as_before(transfer_env):
+    at_once, dwelling = (
+        make_expert("transfer", modes=1, noise=0.0, hold=18, dwell=dwell) for dwell in (0, 26)
+    )
+    (plain, _, before), (stages, _, after) = (play(transfer_env, expert, 3) for expert in (at_once, dwelling))
+    wait = dwelling.style.pop("wait")
+    assert at_once.style == dwelling.style
+    assert wait > 5
+    left = ACTION_NAMES.index("left/gripper")
+    closes = [
+        next(i for i, d in enumerate(decisions) if d.action[left] < 0.5) for decisions in (before, after)
+    ]
+    assert closes[1] - closes[0] == wait
+    assert all(np.array_equal(before[i].action, after[i].action) for i in range(closes[0]))
+    assert max(plain) == max(stages) == transfer_env.success_stage
+
+
+def test_the_time_that_a_hand_dwells_is_geometric():
+    """It has no memory: having waited says nothing about how much longer it will take."""
+    expert = TransferExpert(modes=1, noise=0.0, hold=18, dwell=26)
+    waits = np.array([expert.draw_style(np.random.default_rng(seed))["wait"] for seed in range(4000)])
+    assert waits.min() == 1
+    for steps in (8, 16, 48):
+        assert (waits > steps).mean() == pytest.approx((1 - 1 / 26) ** steps, abs=0.025)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -138,6 +166,11 @@ def test_a_push_is_corrected(env):
             "task.expert.modes must be 1, 2 or 4, found 3",
         ),
         ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18, "dwell": 0}, "task.expert.noise"),
+        (
+            {"name": "socket", "modes": 2, "noise": 0.0, "hold": 18, "dwell": 26},
+            "task.expert.dwell must be 0: only the transfer expert waits, found 26",
+        ),
+        ({"name": "transfer", "modes": 2, "noise": 0.0, "hold": 18, "dwell": -1}, "task.expert.dwell"),
     ],
 )
 def test_mistakes_are_named(arguments, message):

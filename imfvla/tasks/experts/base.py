@@ -91,10 +91,8 @@ class Expert:
         if hold < 1:
             raise UserError(f"task.expert.hold is a number of control steps, at least 1, found {hold!r}.")
         if dwell < 0 or (dwell and not self.dwells):
-            wanted = (
-                "a number of control steps of at least 0" if self.dwells else "0: this expert never waits"
-            )
-            raise UserError(f"task.expert.dwell is {wanted}, found {dwell!r}.")
+            wanted = "at least 0 control steps" if self.dwells else "0: only the transfer expert waits"
+            raise UserError(f"task.expert.dwell must be {wanted}, found {dwell!r}.")
         self.modes, self.noise, self.hold, self.dwell = modes, noise, hold, dwell
         self.style: dict[str, Any] = {}
         self.hands: dict[str, Hand] = {}

@@ -22,16 +22,15 @@ class TransferExpert(Expert):
         self.meeting = np.array([0.0, 0.0, 0.16]) + rng.uniform(-1, 1, 3) * [0.015, 0.02, 0.015]
         self.give_at = rng.uniform(0.05, 0.07)  # along the bar, from its middle to the right
         self.take_at = rng.uniform(-0.07, -0.05)
-        self.wait = (
-            int(rng.geometric(1 / self.dwell)) if self.dwell else 0
-        )  # last: the rest of the style stays
+        # Drawn last, so that the rest of the style does not change with it.
+        self.wait = int(rng.geometric(1 / self.dwell)) if self.dwell else 0
         names = ("meeting_x", "meeting_y", "meeting_z")
-        return {
+        style = {
             **dict(zip(names, self.meeting.tolist(), strict=True)),
             "give_at": self.give_at,
             "take_at": self.take_at,
-            "wait": self.wait,
         }
+        return style | {"wait": self.wait} if self.dwell else style
 
     def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
         left, right = self.hands["left"], self.hands["right"]
