@@ -4,8 +4,9 @@ Noise levels k = 0 ... K - 1 of the squared-cosine schedule (arXiv 2102.09672), 
 variance: z_k = sqrt(abar_k) x + sqrt(1 - abar_k) e. The core is given t = (k + 1) / K and r = t.
 
 With K evaluations sampling is ancestral, with the smaller of the two usual variances ("fixed_small"). With fewer it is
-DDIM without noise (eta = 0) at trailing levels, which begin at the noisiest one: one evaluation then gives the
-conditional mean, where leading levels would give back the noise.
+DDIM without noise (eta = 0) at trailing levels, which begin at the noisiest one: at the optimum one evaluation then
+gives the conditional mean, where leading levels would give back the noise. A trained network's single evaluation does
+depend on its noise (docs/results.md, "Samples and averages").
 
 Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 """
