@@ -51,8 +51,7 @@ class Policy(nn.Module):
 
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
-        actions = self.chunks.normalise(batch.actions, batch.obs.state[:, -1])
-        actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
+        actions = self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
         context = self.core.condition(self.encoder(batch.obs))
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
         return loss.mean(), logs
@@ -62,6 +61,17 @@ class Policy(nn.Module):
         context = self.core.condition(self.encoder(obs))
         chunk = self.generator.sample(self.core, context, noise, nfe)
         return self.chunks.denormalise(chunk, obs.state[:, -1])
+
+
+def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
+    """Actions (B, Tp, A) in which steps that are not `valid` (B, Tp) repeat the last valid action before them.
+
+    They have no error of their own, but a network sees them among its noisy inputs, and a derivative passes through
+    them. What a policy does behind an episode's end is to stay where it is; zeros would be the mean of all chunks.
+    """
+    steps = torch.arange(valid.shape[1], device=valid.device)
+    last = torch.where(valid, steps, 0).cummax(dim=1).values
+    return actions.gather(1, last.unsqueeze(-1).expand_as(actions))
 
 
 def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
@@ -96,7 +106,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         raise UserError(
             f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
             f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
-            f"core.velocity_head=true with generator.v_from=head, any other core with any other generator."
+            f"core.velocity_head=true with generator=imf_staged or generator.v_from=head, "
+            "any other core with any other generator."
         )
     if policy.encoder.last_token != policy.core.last_token:
         raise UserError(

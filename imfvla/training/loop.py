@@ -1,8 +1,8 @@
 """The training loop: any policy with a loss, batches that are a function of their number, a run directory.
 
 Step i (0-based) takes batch i, random numbers of SeedSequence([seed, stream, i]) and the learning rate of i.
-So the state to resume from is the weights, their average and AdamW's moments, and a resumed run equals an
-uninterrupted one bit for bit (same machine, same number of threads).
+So the state to resume from is the weights, their average, AdamW's moments and the gradients' scale, and a resumed run
+equals an uninterrupted one bit for bit (same machine, same number of threads).
 """
 
 import logging
@@ -23,6 +23,7 @@ from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
 from imfvla.signals import Stopped, deferred_stop
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
+from imfvla.training.clipping import Clipping
 from imfvla.training.ema import Ema
 from imfvla.training.logger import MetricsLogger, SilentLogger
 from imfvla.training.non_finite import NonFinite, name_cause
@@ -42,6 +43,7 @@ log = logging.getLogger(__name__)
 class Trainable(Protocol):
     """What the loop asks of a policy, which is also an nn.Module."""
 
+    def begin_step(self, step: int, steps: int) -> None: ...
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
 
 
@@ -90,12 +92,13 @@ class Trainer:
         self.step = self.saved_step = 0
         self.train_s = 0.0  # spent in this and earlier processes
         self._logger_state: dict[str, Any] | None = None
+        self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
         precision: str | None = None
         if run.last_state.exists():
             details = load_state(run.last_state, self.state)
             self.step = self.saved_step = details["step"]
             self.train_s, self._logger_state = details["train_s"], details["logger"]
-            precision = details["precision"]
+            precision, self.clipping.scale = details["precision"], details["gradient_scale"]
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         precision = precision or choose_precision(options.precision, self.device)
@@ -191,14 +194,17 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.processes.average_gradients(self.policy.parameters())
-        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm)).item()
+        limit = self.clipping.limit
+        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit)).item()
         if not math.isfinite(norm):
             return self._skip("norm of the gradient", norm, batch)
+        clipped = self.clipping.update(norm)
         self.optimiser.step()
         self.ema.update(self.step)
         self.step += 1
         self.non_finite.in_a_row = 0
-        return {"loss": loss_value, "grad_norm": norm, "lr": rate} | dict(zip(logs, means, strict=True))
+        measured = {"loss": loss_value, "grad_norm": norm, "clipped": clipped, "lr": rate}
+        return measured | dict(zip(logs, means, strict=True))
 
     def _skip(self, what: str, value: float, batch: Batch) -> None:
         """Leaves the weights as they are. Raises UserError where training is to stop."""
@@ -233,6 +239,7 @@ class Trainer:
             "step": self.step,
             "train_s": self.train_s,
             "precision": self.precision,
+            "gradient_scale": self.clipping.scale,
             "batches": self.batches.state_dict(),
             "logger": logger.state(),
             "code": code_version(),

@@ -72,12 +72,17 @@ class OptimOptions:
     weight_decay: float
     warmup: float  # share of the steps
     floor: float  # share of `lr` at the end
-    clip_norm: float
+    clip_factor: float | None  # gradients are clipped at this multiple of their running norm
+    clip_norm: float | None  # and at this norm, where it is given
     ema_decay: float
 
     def __post_init__(self) -> None:
-        for name in ("lr", "eps", "clip_norm"):
+        for name in ("lr", "eps"):
             require(getattr(self, name) > 0, f"optim.{name}", "above 0", getattr(self, name))
+        # Below 1 the running mean would shrink, and every gradient with it.
+        factor, norm = self.clip_factor, self.clip_norm
+        require(factor is None or factor > 1, "optim.clip_factor", "null or above 1", factor)
+        require(norm is None or norm > 0, "optim.clip_norm", "null or above 0", norm)
         require(self.weight_decay >= 0, "optim.weight_decay", "at least 0", self.weight_decay)
         require(all(0 <= beta < 1 for beta in self.betas), "optim.betas", "two numbers in [0, 1)", self.betas)
         for name in ("warmup", "floor"):
