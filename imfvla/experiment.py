@@ -67,7 +67,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     if not run.last_state.exists() and training.steps not in run.weight_steps():
         initialise_from_pretrained(policy)
     for nfe in evaluation.nfe:
-        policy.generator.check_nfe(nfe)
+        policy.check_sampling(nfe, evaluation.noise_scale)
     seed = config["seed"]
     require(isinstance(seed, int) and seed >= 0, "seed", "a whole number of at least 0", seed)
     run.refuse_links_outside()

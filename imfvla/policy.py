@@ -14,6 +14,7 @@ from imfvla.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
+from imfvla.protocol import USUAL_NOISE
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -55,6 +56,15 @@ class Policy(nn.Module):
         context = self.core.condition(self.encoder(batch.obs))
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
         return loss.mean(), logs
+
+    def check_sampling(self, nfe: int, noise_scale: float) -> None:
+        """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale."""
+        self.generator.check_nfe(nfe)
+        if noise_scale != USUAL_NOISE and nfe == getattr(self.generator, "ancestral_nfe", None):
+            raise UserError(
+                f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: ancestral sampling draws "
+                "noise of its own in every step, which the scale does not reach. Take fewer evaluations (DDIM)."
+            )
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         """Action chunks (B, Tp, A) in physical units from noise (B, Tp, A) and `nfe` evaluations of the core."""

@@ -169,6 +169,14 @@ def test_a_policy_without_statistics_predicts_nothing_that_looks_valid():
     assert made.predict(data.obs, torch.zeros(3, 8, 16), 1).isnan().all()
 
 
+def test_noise_of_another_scale_is_refused_where_later_steps_draw_their_own():
+    made = build_policy(compose("train", ["generator=ddpm"]))
+    made.check_sampling(100, 1.0)
+    made.check_sampling(10, 0.0)
+    with pytest.raises(UserError, match=r"^noise_scale must be 1 with nfe=100, found 0\.5: ancestral"):
+        made.check_sampling(100, 0.5)
+
+
 def test_no_evaluation_is_refused():
     with pytest.raises(UserError, match="at least 1, found 0"):
         policy().predict(batch().obs, torch.zeros(3, 8, 16), 0)

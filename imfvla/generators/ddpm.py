@@ -81,7 +81,7 @@ class DenoisingDiffusion:
         self.prediction = prediction
         self.clip_sample, self.clip = clip_sample, clip
         self.draws = draws
-        self.num_levels = num_levels
+        self.num_levels = self.ancestral_nfe = num_levels  # where each step draws noise of its own
         self.kept = squared_cosine(num_levels).tolist()
 
     def loss(
