@@ -45,6 +45,13 @@ class Policy(nn.Module):
         """(Tp, A) of the noise that one prediction starts from."""
         return self.horizon.pred, self.action_dim
 
+    def first_steps(self, steps: int) -> dict[str, int]:
+        """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
+        if not hasattr(self.generator, "first_steps"):
+            return {}
+        later = self.generator.first_steps(self.core, steps)
+        return {f"core.{name}": step for name, step in later.items()}
+
     def begin_step(self, step: int, steps: int) -> None:
         """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
         if hasattr(self.generator, "begin_step"):

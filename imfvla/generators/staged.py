@@ -51,12 +51,22 @@ class StagedMeanFlow(AverageVelocity):
         self.average_from, self.path_steps, self.average_weight = average_from, path_steps, average_weight
         self.learns_average = False
 
+    def first_steps(self, core: nn.Module, steps: int) -> dict[str, int]:
+        """The step at which the blocks of the average velocity begin to learn, by the names of their parameters."""
+        if self.core_interface == "flow":
+            return {}
+        first = self._first_step(steps)
+        return {name: first for name, _ in core.named_parameters() if name.startswith("average.")}
+
     def begin_step(self, core: nn.Module, step: int, steps: int) -> None:
         """Starts the second stage where its first step is due."""
-        first = round(self.average_from * steps)
+        first = self._first_step(steps)
         if step == first and self.core_interface == "flow and v-head":
             core.start_average()
         self.learns_average = step >= first
+
+    def _first_step(self, steps: int) -> int:
+        return round(self.average_from * steps)
 
     def path_velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
         """Mean of v along the flow from z at t to r, without gradient: (B, H, A)."""

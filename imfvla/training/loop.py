@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 class Trainable(Protocol):
     """What the loop asks of a policy, which is also an nn.Module."""
 
+    def first_steps(self, steps: int) -> dict[str, int]: ...
     def begin_step(self, step: int, steps: int) -> None: ...
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
 
@@ -83,11 +84,12 @@ class Trainer:
         self.batches, self.run, self.options, self.optim = batches, run, options, optim
         self.seed, self.description = seed, dict(description)
         self.processes.begin_alike(self.policy)
-        self.ema = Ema(self.policy, optim.ema_decay)
+        later = self.policy.first_steps(options.steps)
+        self.ema = Ema(self.policy, optim.ema_decay, later)
         if options.sharding == FULL:
             shard(self.policy, self.device, loss="loss")
             shard(self.ema.policy, self.device)
-        self.optimiser = make_optimiser(self.policy, optim)
+        self.optimiser = make_optimiser(self.policy, optim, later)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
         self.step = self.saved_step = 0
         self.train_s = 0.0  # spent in this and earlier processes
@@ -174,15 +176,8 @@ class Trainer:
         """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
         seed = step_seed(self.seed, self.step)
         torch.manual_seed(seed)  # for dropout and the like, which take no generator
-        rate = learning_rate(
-            self.step,
-            steps=self.options.steps,
-            peak=self.optim.lr,
-            warmup=self.optim.warmup,
-            floor=self.optim.floor,
-        )
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = self._rate(group["first_step"])
         share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
         for policy in (self.policy, self.ema.policy):
             policy.begin_step(self.step, self.options.steps)
@@ -203,8 +198,23 @@ class Trainer:
         self.ema.update(self.step)
         self.step += 1
         self.non_finite.in_a_row = 0
-        measured = {"loss": loss_value, "grad_norm": norm, "clipped": clipped, "lr": rate}
+        measured = {
+            "loss": loss_value,
+            "grad_norm": norm,
+            "clipped": clipped,
+            "lr": self.optimiser.param_groups[0]["lr"],
+        }
         return measured | dict(zip(logs, means, strict=True))
+
+    def _rate(self, first: int) -> float:
+        """The learning rate of this step for parameters whose training begins at step `first`."""
+        return learning_rate(
+            max(0, self.step - first),
+            steps=self.options.steps - first,
+            peak=self.optim.lr,
+            warmup=self.optim.warmup,
+            floor=self.optim.floor,
+        )
 
     def _skip(self, what: str, value: float, batch: Batch) -> None:
         """Leaves the weights as they are. Raises UserError where training is to stop."""

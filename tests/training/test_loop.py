@@ -61,6 +61,10 @@ class StagedPolicy(nn.Module):
         )  # fmt: skip
         self.dies_at, self.step = dies_at, 0
 
+    def first_steps(self, steps):
+        later = self.generator.first_steps(self.core, steps)
+        return {f"core.{name}": step for name, step in later.items()}
+
     def begin_step(self, step, steps):
         self.step = step
         self.generator.begin_step(self.core, step, steps)

@@ -50,6 +50,9 @@ class TinyPolicy(nn.Module):
         self.query = nn.Parameter(torch.zeros(2, 16))  # never used: AdamW keeps nothing of it
         self.register_buffer("scale", torch.ones(ACTION))
 
+    def first_steps(self, steps: int) -> dict[str, int]:
+        return {}
+
     def begin_step(self, step: int, steps: int) -> None:
         pass
 
