@@ -27,6 +27,8 @@ LOG_NAME = "collection.json"
 EPISODE_TIMEOUT_S = 900.0
 MAX_CAMERA_EVERY = 700  # control steps of an episode
 NOT_EMPTY = Limit("a text that is not empty", bool)
+# What folders were recorded with before a setting had a name.
+LATER_SETTINGS = {"dwell": 0}
 log = logging.getLogger(__name__)
 
 
@@ -57,6 +59,7 @@ class ExpertOptions:
     modes: int
     noise: float
     hold: int
+    dwell: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,7 @@ class Settings:
     modes: int
     noise: float
     hold: int
+    dwell: int
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -114,7 +118,8 @@ def collect(
     _stage_for(settings)  # what cannot be simulated is told before anything is written
     began = time.perf_counter()
     height, width = settings.image_size
-    name = f"{settings.task}-{settings.variant}-modes{settings.modes}-{height}x{width}"
+    waiting = f"-dwell{settings.dwell}" if settings.dwell else ""
+    name = f"{settings.task}-{settings.variant}-modes{settings.modes}{waiting}-{height}x{width}"
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may want the same demonstrations
         listed = _Log(directory, settings)
@@ -226,7 +231,9 @@ def _stage_for(settings: Settings) -> tuple[Any, Any]:
     env = tasks.load(
         settings.task, variant=settings.variant, image_size=settings.image_size, views=settings.views
     )
-    return env, make_expert(settings.task, modes=settings.modes, noise=settings.noise, hold=settings.hold)
+    return env, make_expert(
+        settings.task, modes=settings.modes, noise=settings.noise, hold=settings.hold, dwell=settings.dwell
+    )
 
 
 class _Log:
@@ -269,7 +276,7 @@ class _Log:
         """The settings and the seeds that failed."""
         try:
             found = parse_json(read_text(self._path, MAX_JSON_BYTES))
-            return dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
+            return LATER_SETTINGS | dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
         except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise UserError(f"{self._path} is damaged ({error}); {self._remedy}.") from error
 

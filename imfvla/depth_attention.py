@@ -3,8 +3,9 @@
 Shapes: B batch, T tokens, S sources so far, L sublayers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,8 @@ class DepthWeights:
 def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
     """Inside, every pass through `core` adds its weights to what is yielded; what it computes stays as it is.
 
-    Raises UserError where the core has no Attention Residuals.
+    The action tokens are those of the blocks that sample: a core may have others for the instantaneous velocity, which
+    hold the context. Raises UserError where the core has no Attention Residuals.
     """
     residual = getattr(core, "residual", None)
     if not isinstance(residual, AttentionResidual):
@@ -55,7 +57,7 @@ def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
             "trained with core=attnres or core=block_attnres."
         )
     recorded = DepthWeights(len(residual.query))
-    begin = residual.begin
+    residuals = [residual, *([core.average.residual] if getattr(core, "average", None) else [])]
     in_forward = False
 
     def enter(*_: Any) -> None:
@@ -66,7 +68,7 @@ def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
         nonlocal in_forward
         in_forward = False
 
-    def begin_recorded(embedding: Tensor) -> History:
+    def begin_recorded(begin: Callable[[Tensor], History], embedding: Tensor) -> History:
         history = begin(embedding)
         kind = ACTIONS if in_forward else CONTEXT
         aggregate, weights = history.aggregate, history.weights
@@ -85,11 +87,13 @@ def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
         return history
 
     hooks = [core.register_forward_pre_hook(enter), core.register_forward_hook(leave)]
-    residual.begin = begin_recorded
+    for residual in residuals:
+        residual.begin = partial(begin_recorded, residual.begin)
     try:
         yield recorded
     finally:
-        del residual.begin  # the class's again
+        for residual in residuals:
+            del residual.begin  # the class's again
         for hook in hooks:
             hook.remove()
 

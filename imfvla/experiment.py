@@ -40,7 +40,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     options = read_options(config)
     training, optim, evaluation = options.training, options.optim, options.evaluation
     is_trained = training.steps in run.weight_steps()
-    policy = rehearse(config, evaluation.nfe)
+    policy = rehearse(config, evaluation.nfe, evaluation.noise_scale)
     if not is_trained:
         check_demonstrations(config)
         if not run.last_state.exists():

@@ -49,6 +49,9 @@ def some(each: Limit) -> Limit:
     )
 
 
+SHARE_BELOW_1 = Limit("in [0, 1)", lambda value: 0 <= value < 1)
+
+
 def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
     """`cls(**values)` for a dataclass of numbers, texts, flags and tuples of them.
 

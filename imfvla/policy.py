@@ -14,6 +14,7 @@ from imfvla.construction import construct, reason_of
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
+from imfvla.protocol import USUAL_NOISE
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -44,19 +45,50 @@ class Policy(nn.Module):
         """(Tp, A) of the noise that one prediction starts from."""
         return self.horizon.pred, self.action_dim
 
+    def first_steps(self, steps: int) -> dict[str, int]:
+        """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
+        if not hasattr(self.generator, "first_steps"):
+            return {}
+        later = self.generator.first_steps(self.core, steps)
+        return {f"core.{name}": step for name, step in later.items()}
+
+    def begin_step(self, step: int, steps: int) -> None:
+        """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
+        if hasattr(self.generator, "begin_step"):
+            self.generator.begin_step(self.core, step, steps)
+
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
-        actions = self.chunks.normalise(batch.actions, batch.obs.state[:, -1])
-        actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
+        actions = self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
         context = self.core.condition(self.encoder(batch.obs))
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
         return loss.mean(), logs
+
+    def check_sampling(self, nfe: int, noise_scale: float) -> None:
+        """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale."""
+        self.generator.check_nfe(nfe)
+        if noise_scale != USUAL_NOISE and nfe == getattr(self.generator, "ancestral_nfe", None):
+            raise UserError(
+                f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: ancestral sampling draws "
+                "noise of its own in every step, which the scale does not reach. Take fewer evaluations (DDIM)."
+            )
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         """Action chunks (B, Tp, A) in physical units from noise (B, Tp, A) and `nfe` evaluations of the core."""
         context = self.core.condition(self.encoder(obs))
         chunk = self.generator.sample(self.core, context, noise, nfe)
         return self.chunks.denormalise(chunk, obs.state[:, -1])
+
+
+def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
+    """Actions (B, Tp, A) in which steps that are not `valid` (B, Tp) repeat the last valid action before them.
+
+    They have no error of their own, but a network sees them among its noisy inputs, and a derivative passes through
+    them. What a policy does behind an episode's end is to stay where it is; zeros would be the mean of all chunks.
+    """
+    steps = torch.arange(valid.shape[1], device=valid.device)
+    last = torch.where(valid, steps, 0).cummax(dim=1).values
+    return actions.gather(1, last.unsqueeze(-1).expand_as(actions))
 
 
 def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
@@ -91,7 +123,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         raise UserError(
             f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
             f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
-            f"core.velocity_head=true with generator.v_from=head, any other core with any other generator."
+            f"core.velocity_head=true with generator=imf_staged or generator.v_from=head, "
+            "any other core with any other generator."
         )
     if policy.encoder.last_token != policy.core.last_token:
         raise UserError(

@@ -16,7 +16,7 @@ from imfvla.horizon import Horizon
 from imfvla.instruction import MAX_WORDS
 from imfvla.options import build, one_of, part_of, require, within
 from imfvla.policy import Policy, build_policy
-from imfvla.protocol import MAX_SEED, EvaluationOptions
+from imfvla.protocol import MAX_SEED, USUAL_NOISE, EvaluationOptions
 from imfvla.run_directory import step_of
 from imfvla.training.loop import choose_device
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -71,7 +71,7 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
     return ExperimentOptions(training, optim, evaluation)
 
 
-def rehearse(config: Mapping[str, Any], nfe: Sequence[int]) -> Policy:
+def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
     """The configured policy, after a loss and a chunk on black pictures.
 
     Raises UserError where it cannot be built, cannot compute them, or cannot do with one of the numbers of evaluations.
@@ -79,7 +79,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int]) -> Policy:
     try:
         policy = build_unfitted(config).eval()
         for number in nfe:
-            policy.generator.check_nfe(number)
+            policy.check_sampling(number, noise_scale)
         observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():

@@ -88,6 +88,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
     env, policy = _bench(job.build, job.run, job.step)
+    policy.check_sampling(job.nfe, job.noise_scale)
     actor = ChunkActor(
         policy.to(job.device),
         policy.horizon,

@@ -98,6 +98,9 @@ class KnownPolicy:
         assert device == "cpu"
         return self
 
+    def check_sampling(self, nfe: int, noise_scale: float) -> None:
+        pass
+
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         pixels = obs.images[0, :, 0, 0, 0].int().numpy()  # (To, W) of the red channel's first line
         steps = 256 * pixels[:, 0] + pixels[:, 1]

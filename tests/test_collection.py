@@ -10,7 +10,7 @@ from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.recording import read_episode
 
-TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002, "hold": 18}}
+TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002, "hold": 18, "dwell": 0}}
 OBSERVATION = {"views": ["front", "r_wrist"], "image_size": [24, 32]}
 
 
@@ -132,7 +132,7 @@ def test_files_beside_the_demonstrations_are_named_and_not_used(recorded, caplog
 def test_a_folder_of_other_settings_is_refused_and_kept(recorded):
     before = files(folder(recorded))
     for task, observation in (
-        ({**TASK, "expert": {"modes": 2, "noise": 0.01, "hold": 18}}, OBSERVATION),
+        ({**TASK, "expert": {"modes": 2, "noise": 0.01, "hold": 18, "dwell": 0}}, OBSERVATION),
         (TASK, {**OBSERVATION, "views": ["front"]}),
     ):
         with pytest.raises(UserError, match=r"was recorded with (noise|views)=.* is wanted; choose another"):

@@ -50,7 +50,7 @@ def described(row) -> str:
     """The line of docs/design.md on a row of the paper; values at scale=cpu / scale=paper where they differ."""
     cells = []
     for scale in ("cpu", "paper"):
-        config = compose("train", [f"+exp={row.experiment}", f"scale={scale}"])
+        config = compose("train", [f"+exp={row.experiment}", *row.overrides, f"scale={scale}"])
         with torch.device("meta"):
             encoder = instantiate(config["encoder"], _convert_="all")
             core = instantiate(config["core"], _convert_="all")

@@ -14,10 +14,11 @@ from imfvla.nn.transformer import TransformerCore
 DEPTH = 3
 
 
-def core_with(residual) -> TransformerCore:
+def core_with(residual, velocity_head=False) -> TransformerCore:
     torch.manual_seed(0)
     core = TransformerCore(
-        steps=8, channels=2, width=8, depth=DEPTH, heads=2, patch=4, mlp_ratio=2.0, max_rad=10.0, residual=residual
+        steps=8, channels=2, width=8, depth=DEPTH, heads=2, patch=4, mlp_ratio=2.0, max_rad=10.0, residual=residual,
+        velocity_head=velocity_head,
     )  # fmt: skip
     for parameter in core.parameters():
         nn.init.normal_(parameter, std=0.3)
@@ -48,6 +49,15 @@ def test_every_sublayer_spreads_one_over_what_came_before(readout):
         *range(1, 2 * DEPTH),
         *[0] * (1 + (readout == "attn")),
     ]
+
+
+def test_where_both_velocities_have_blocks_those_that_sample_are_shown():
+    core = core_with(AttentionResidual, velocity_head=True)
+    nn.init.zeros_(core.average.residual.query)
+    with record_depth_weights(core) as recorded:
+        run(core)
+    assert recorded.rows(ACTIONS)[3] == pytest.approx([0.25] * 4)
+    assert recorded.rows(CONTEXT)[3] != pytest.approx([0.25] * 4, abs=1e-3)
 
 
 def test_queries_of_zero_weigh_all_alike():

@@ -8,7 +8,7 @@ from imfvla.gallery import write_gallery
 
 @pytest.mark.parametrize("name", tasks.NAMES)
 def test_both_ways_of_the_hidden_choice_are_shown_from_one_start(name, tmp_path):
-    task = {"name": name, "variant": "easy", "expert": {"modes": 2, "noise": 0.0, "hold": 18}}
+    task = {"name": name, "variant": "easy", "expert": {"modes": 2, "noise": 0.0, "hold": 18, "dwell": 0}}
     paths = write_gallery(task, 0, 24, tmp_path)
     sheets = [cv2.imread(str(path)) for path in paths]
     shape = sheets[0].shape

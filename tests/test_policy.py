@@ -7,7 +7,7 @@ import torch
 from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS, tokenize
-from imfvla.policy import build_policy
+from imfvla.policy import build_policy, hold_last
 from imfvla.types import Batch, Observation
 
 STATISTICS = SimpleNamespace(
@@ -103,8 +103,33 @@ def test_loss_is_unchanged_by_garbage_in_padded_steps():
     assert torch.equal(loss(made, data), loss(made, Batch(data.obs, garbage, data.valid)))
 
 
+def test_steps_that_are_not_valid_repeat_the_last_action_before_them():
+    valid = torch.tensor([[True, True, False, False], [True, True, True, True]])
+    actions = torch.tensor([[1.0, 2.0, torch.nan, 9.0], [1.0, 2.0, 3.0, 4.0]]).unsqueeze(-1)
+    held = hold_last(actions, valid).squeeze(-1)
+    assert held.tolist() == [[1.0, 2.0, 2.0, 2.0], [1.0, 2.0, 3.0, 4.0]]
+
+
+def test_what_a_generator_sees_behind_an_episode_s_end_is_the_held_action_not_the_mean():
+    made, data = policy(), batch()
+    seen = []
+    made.generator.loss = lambda core, context, actions, *_: (seen.append(actions), actions.mean((1, 2)), {})[
+        1:
+    ]
+    loss(made, data)
+    chunk = made.chunks.denormalise(seen[0], data.obs.state[:, -1])
+    torch.testing.assert_close(chunk[-1, 5:], data.actions[-1, 4].expand(3, -1))
+
+
 @pytest.mark.parametrize(
-    "groups", [["generator=act"], ["core=act"], ["core.velocity_head=true"], ["generator.v_from=head"]]
+    "groups",
+    [
+        ["generator=act"],
+        ["core=act"],
+        ["core.velocity_head=true"],
+        ["generator.v_from=head"],
+        ["generator=imf_staged", "core.velocity_head=false"],
+    ],
 )
 def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
     with pytest.raises(
@@ -142,6 +167,14 @@ def test_predictions_lie_in_the_range_of_the_demonstrated_actions(nfe):
 def test_a_policy_without_statistics_predicts_nothing_that_looks_valid():
     made, data = policy(statistics=None), batch()
     assert made.predict(data.obs, torch.zeros(3, 8, 16), 1).isnan().all()
+
+
+def test_noise_of_another_scale_is_refused_where_later_steps_draw_their_own():
+    made = build_policy(compose("train", ["generator=ddpm"]))
+    made.check_sampling(100, 1.0)
+    made.check_sampling(10, 0.0)
+    with pytest.raises(UserError, match=r"^noise_scale must be 1 with nfe=100, found 0\.5: ancestral"):
+        made.check_sampling(100, 0.5)
 
 
 def test_no_evaluation_is_refused():

@@ -1,9 +1,11 @@
-"""Trains the generators on eight Gaussians and judges their samples; exits with 1 where one is not as it must be.
+"""Trains the configured generators on eight Gaussians and judges their samples; exits with 1 where one is not right.
 
 python tools/toy.py --out runs/toy
 
-iMF in one evaluation and flow matching and DDPM in 100 must pass; flow matching in one evaluation and iMF with the sign
-of its derivative flipped must fail the same test. Writes toy.json, toy.svg and toy.png.
+Generators are those of conf/generator as they are. iMF, plain and in stages, in one evaluation and flow matching and
+DDPM in 100 must pass; flow matching in one evaluation and iMF with the sign of its derivative flipped must fail the
+same test.
+Writes toy.json, toy.svg and toy.png.
 """
 
 from imfvla.command import as_command, begin

@@ -13,6 +13,8 @@ from imfvla.policy import Policy
 from imfvla.training.precision import autocast
 from imfvla.types import Batch
 
+LAST_STEP = 999
+
 
 def count_flops(function: Callable[[], object]) -> int:
     """Of one call of `function`."""
@@ -27,8 +29,9 @@ def count_flops(function: Callable[[], object]) -> int:
 
 
 def training_flops(policy: Policy, batch: Batch, precision: str) -> int:
-    """Of one loss and its gradient, which is thrown away; the policy is left in training mode."""
+    """Of one loss and its gradient at a training's end; the gradient is thrown away, the policy left in train mode."""
     policy.train()
+    policy.begin_step(LAST_STEP, LAST_STEP + 1)  # of the stages of a training the last, which costs most
 
     def learn() -> None:
         with autocast(precision, batch.actions.device):

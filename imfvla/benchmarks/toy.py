@@ -1,4 +1,4 @@
-"""Eight Gaussians in the plane: what a generator makes of many modes, without pictures and robots.
+"""Eight Gaussians in the plane: what the configured generators make of many modes, without pictures and robots.
 
 The modes lie on a circle of radius 2, deviation 0.1, all scaled to unit variance. A generator is judged by samples: its
 energy distance to fresh data, the modes it reaches, and the share of samples within four deviations of a mode.
@@ -6,6 +6,7 @@ energy distance to fresh data, the modes it reaches, and the share of samples wi
 Shapes: B batch, N samples; a sample is a chunk of one step with two channels.
 """
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -14,10 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.generators.base import UniformTimes
-from imfvla.generators.ddpm import DenoisingDiffusion
-from imfvla.generators.flow import FlowMatching
-from imfvla.generators.imf import ImprovedMeanFlow
+from imfvla.composition import compose
+from imfvla.construction import construct
 from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.linear import Linear
 from imfvla.training.ema import Ema
@@ -26,6 +25,7 @@ NUM_MODES, RADIUS, DEVIATION, SCALE = 8, 2.0, 0.1, 1 / math.sqrt(2)
 SIGMAS = 4.0
 LEAST_SHARE_OF_MODE = 0.5  # of the samples that are due to a mode, for it to count as reached
 BATCH, RATE = 512, 2e-3
+MAX_RAD = 1.0  # of the time embeddings
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +73,16 @@ def energy_distance(x: Tensor, y: Tensor) -> float:
 
 
 class PlaneCore(nn.Module):
-    """A residual MLP (x, t, r) -> x, of the kind that flow generators drive; the context is not used."""
+    """A residual MLP (x, t, r) -> x, of the kind that flow generators drive; the context is not used.
 
-    def __init__(self, width: int, depth: int) -> None:
+    With `velocity_head` average and instantaneous velocity have layers each of their own, as in `TransformerCore`.
+    """
+
+    def __init__(self, width: int, depth: int, *, velocity_head: bool = False) -> None:
         super().__init__()
         self.input = Linear(2, width)
-        self.time = TimeEmbedding(width, max_rad=1.0)
-        self.interval = TimeEmbedding(width, max_rad=1.0)
+        self.time = TimeEmbedding(width, MAX_RAD)
+        self.interval = TimeEmbedding(width, MAX_RAD)
         self.blocks = nn.ModuleList(
             nn.Sequential(
                 nn.LayerNorm(width, elementwise_affine=False),
@@ -91,9 +94,24 @@ class PlaneCore(nn.Module):
         )
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
         self.output = Linear(width, 2)
+        self.average: PlaneCore | None = copy.deepcopy(self) if velocity_head else None
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Any) -> Tensor:
         """x (B, 1, 2), times (B,) -> (B, 1, 2)."""
+        return (self.average or self).layers(x, t, r)
+
+    def instant(self, x: Tensor, t: Tensor, context: Any) -> Tensor:
+        """What the layers of the instantaneous velocity say, r = t."""
+        return self.layers(x, t, t)
+
+    @torch.no_grad()
+    def start_average(self) -> None:
+        """The layers of the average velocity take the weights of those of the instantaneous one."""
+        learned = dict(self.named_parameters())
+        for name, parameter in self.average.named_parameters():
+            parameter.copy_(learned[name])
+
+    def layers(self, x: Tensor, t: Tensor, r: Tensor) -> Tensor:
         condition = self.time(t) + self.interval(t - r)
         hidden = self.input(x[:, 0]) + condition
         for block in self.blocks:
@@ -110,45 +128,37 @@ class NoContext:
     detach = rows = repeat
 
 
-class FlippedMeanFlow(ImprovedMeanFlow):
-    """iMF with the sign of its derivative flipped: a mistake that the judgement must find."""
+def shipped(name: str) -> Any:
+    """The generator of conf/generator/<name>.yaml as it is."""
+    return construct(compose("train", [f"generator={name}"])["generator"], "generator")
 
-    def derivative(self, *arguments: Any) -> tuple[Tensor, Tensor]:
-        u, dudt = super().derivative(*arguments)
+
+def flipped(generator: Any) -> Any:
+    """The same with the sign of its derivative flipped: a mistake that the judgement must find."""
+    derivative = generator.derivative
+
+    def wrong(*arguments: Any) -> tuple[Tensor, Tensor]:
+        u, dudt = derivative(*arguments)
         return u, -dudt
 
+    generator.derivative = wrong
+    return generator
 
-PATH = {
-    "parametrisation": "velocity",
-    "times": UniformTimes(),
-    "time_power": 0.0,
-    "adaptive_offset": 1e-3,
-    "draws": 1,
-    "clip": 10.0,
-}
-MEAN_FLOW = {
-    **PATH,
-    "adaptive_power": 0.5,
-    "boundary_share": 0.1,
-    "v_from": "boundary",
-    "instant_weight": 1.0,
-    "compound_target": "sample",
-    "compound_draws": 1,
-}
+
 GENERATORS: dict[str, Callable[[], Any]] = {
-    "iMF": lambda: ImprovedMeanFlow(**MEAN_FLOW),
-    "iMF, sign flipped": lambda: FlippedMeanFlow(**MEAN_FLOW),
-    "flow matching": lambda: FlowMatching(**PATH, adaptive_power=0.0),
-    "DDPM": lambda: DenoisingDiffusion(
-        num_levels=100, prediction="epsilon", clip_sample=True, draws=1, clip=2.5
-    ),
+    "imf": lambda: shipped("imf"),
+    "imf, sign flipped": lambda: flipped(shipped("imf")),
+    "imf_staged": lambda: shipped("imf_staged"),
+    "flow_high_noise": lambda: shipped("flow_high_noise"),
+    "ddpm": lambda: shipped("ddpm"),
 }
 CASES = (  # generator, evaluations, whether it has to pass
-    ("iMF", 1, True),
-    ("flow matching", 100, True),
-    ("DDPM", 100, True),
-    ("flow matching", 1, False),
-    ("iMF, sign flipped", 1, False),
+    ("imf", 1, True),
+    ("imf_staged", 1, True),
+    ("flow_high_noise", 100, True),
+    ("ddpm", 100, True),
+    ("flow_high_noise", 1, False),
+    ("imf, sign flipped", 1, False),
 )
 
 
@@ -176,13 +186,16 @@ def train(
 ) -> nn.Module:
     """The averaged weights of a core that `generator` has trained; calls `advance` after each step."""
     torch.manual_seed(seed)
-    core = PlaneCore(width, depth)
+    core = PlaneCore(width, depth, velocity_head=generator.core_interface == "flow and v-head")
     ema = Ema(core, 0.999)
     optimiser = torch.optim.Adam(core.parameters(), RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     rng = torch.Generator().manual_seed(seed)
     valid = torch.ones(BATCH, 1, dtype=torch.bool)
     for step in range(steps):
+        if hasattr(generator, "begin_step"):
+            for learner in (core, ema.policy):
+                generator.begin_step(learner, step, steps)
         loss, _ = generator.loss(core, NoContext(), draw(BATCH, rng).unsqueeze(1), valid, rng)
         optimiser.zero_grad()
         loss.mean().backward()

@@ -13,7 +13,7 @@ from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
-from imfvla.policy import Policy
+from imfvla.policy import Policy, hold_last
 from imfvla.recording import Recordings
 from imfvla.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
@@ -86,8 +86,7 @@ def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -
         with _timed(spent, "encoder"):
             context = policy.core.condition(policy.encoder(batch.obs))
         with _timed(spent, "core"), _timed_derivative(policy.generator, spent):
-            actions = policy.chunks.normalise(batch.actions, batch.obs.state[:, -1])
-            actions = actions.masked_fill(~batch.valid.unsqueeze(-1), 0.0)
+            actions = policy.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
             loss, _ = policy.generator.loss(
                 policy.core, context, actions, batch.valid, torch.Generator().manual_seed(trainer.step)
             )
@@ -96,7 +95,7 @@ def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -
     with _timed(spent, "backward"):
         loss.backward()
     with _timed(spent, "optimiser"):
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), trainer.optim.clip_norm)
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), trainer.clipping.limit)
         trainer.optimiser.step()
         trainer.optimiser.zero_grad(set_to_none=True)
         trainer.ema.update(trainer.step)

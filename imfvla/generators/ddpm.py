@@ -4,8 +4,9 @@ Noise levels k = 0 ... K - 1 of the squared-cosine schedule (arXiv 2102.09672), 
 variance: z_k = sqrt(abar_k) x + sqrt(1 - abar_k) e. The core is given t = (k + 1) / K and r = t.
 
 With K evaluations sampling is ancestral, with the smaller of the two usual variances ("fixed_small"). With fewer it is
-DDIM without noise (eta = 0) at trailing levels, which begin at the noisiest one: one evaluation then gives the
-conditional mean, where leading levels would give back the noise.
+DDIM without noise (eta = 0) at trailing levels, which begin at the noisiest one: at the optimum one evaluation then
+gives the conditional mean, where leading levels would give back the noise. A trained network's single evaluation does
+depend on its noise (docs/results.md, "Samples and averages").
 
 Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 """
@@ -81,7 +82,7 @@ class DenoisingDiffusion:
         self.prediction = prediction
         self.clip_sample, self.clip = clip_sample, clip
         self.draws = draws
-        self.num_levels = num_levels
+        self.num_levels = self.ancestral_nfe = num_levels  # where each step draws noise of its own
         self.kept = squared_cosine(num_levels).tolist()
 
     def loss(

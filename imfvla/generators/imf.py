@@ -6,7 +6,7 @@ along the marginal flow: the Jacobian-vector product of u in the direction (v, 0
 same network. The gradient flows through the primal u alone.
 
 Beside the compound loss, the instantaneous velocity that the tangent needs anyway is regressed on e - x too ("dual
-pass", arXiv 2608.16153). It is the boundary case u(z_t, t, t), or the output of a second head of the core.
+pass", arXiv 2608.16153). It is the boundary case u(z_t, t, t), or comes from blocks of its own.
 
 Shapes: B batch, N draws per observation, H steps, A action.
 """
@@ -25,7 +25,7 @@ from imfvla.options import at_least
 class ImprovedMeanFlow(AverageVelocity):
     """Learns and samples an average velocity.
 
-    v_from: where v comes from: "boundary", u(z_t, t, t), or "head", a second output layer of the core.
+    v_from: where v comes from: "boundary", u(z_t, t, t), or "head", action blocks of its own in the core.
     instant_weight: weight of the loss on v, the flow-matching part.
     compound_target: "sample" regresses V on e - x (paper); "network" on v, the same network's estimate of its mean.
     compound_draws: how many draws of an observation enter the compound loss too.
@@ -47,16 +47,9 @@ class ImprovedMeanFlow(AverageVelocity):
             raise UserError(
                 f"generator.compound_target must be sample or network, found {compound_target!r}."
             )
-        self.v_from = v_from
         self.core_interface = "flow and v-head" if v_from == "head" else "flow"
         self.instant_weight = instant_weight
         self.compound_target = compound_target
-
-    def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
-        """v(z, t): z (B, H, A), t (B,) -> (B, H, A)."""
-        if self.v_from == "boundary":
-            return self.velocity(core, z, t, t, context)
-        return self.velocity(lambda z, t, r, context: core.instant(z, t, context), z, t, t, context)
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator

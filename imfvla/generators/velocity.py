@@ -14,7 +14,7 @@ from imfvla.generators.base import TimeSampler, refuse_nfe
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
 
-MIN_TIME = 0.02  # u = (z - D) / t: in training the division stops below this time
+MIN_TIME = 0.02  # of training in the data form u = (z - D) / t, whose error grows without bound towards t = 0
 
 
 def interpolate(x: Tensor, noise: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -57,14 +57,21 @@ class LinearPath:
         self.draws = draws
         self.clip = clip
 
-    def velocity(
-        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, min_time: float = MIN_TIME
-    ) -> Tensor:
-        """u(z, r, t): z (B, H, A), r and t (B,) -> (B, H, A). `min_time` bounds what the data form divides by."""
+    def velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
+        """u(z, r, t): z (B, H, A), r and t > 0 (B,) -> (B, H, A)."""
         output = core(z, t, r, context)
         if self.parametrisation == "velocity":
             return output
-        return (z - output) / t.clamp(min=min_time)[:, None, None]
+        return (z - output) / t[:, None, None]
+
+    def draw_times(self, count: int, rng: torch.Generator) -> Tensor:
+        """Times t (count,) to train at; in the data form none is below MIN_TIME.
+
+        The draw is bounded, not the division: at a smaller t, (z - D) / max(t, MIN_TIME) is no velocity of the path,
+        and its derivative breaks the identity that an average velocity is learned from.
+        """
+        t = self.times(count, rng)
+        return t.clamp(min=MIN_TIME) if self.parametrisation == "data" else t
 
     def repeat(
         self, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
@@ -96,7 +103,7 @@ class LinearPath:
         z = noise
         for t, r in pairwise(times):
             ts, rs = t.expand(len(z)), r.expand(len(z))
-            z = z - (t - r) * self.velocity(core, z, rs, ts, context, min_time=0.0)
+            z = z - (t - r) * self.velocity(core, z, rs, ts, context)
         return z.clamp(-self.clip, self.clip)
 
 
@@ -125,6 +132,12 @@ class AverageVelocity(LinearPath):
         self.boundary_share = boundary_share
         self.compound_draws = compound_draws
 
+    def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
+        """v(z, t), of blocks of its own where the core has them, else u(z, t, t): z (B, H, A), t (B,) -> (B, H, A)."""
+        if self.core_interface == "flow":
+            return self.velocity(core, z, t, t, context)
+        return self.velocity(lambda z, t, r, context: core.instant(z, t, context), z, t, t, context)
+
     def derivative(
         self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
     ) -> tuple[Tensor, Tensor]:
@@ -137,7 +150,7 @@ class AverageVelocity(LinearPath):
 
     def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """Times r <= t (count,) of the compound loss."""
-        t = self.times(count, rng)
+        t = self.draw_times(count, rng)
         r = t * torch.rand(count, generator=rng)
         boundary = torch.rand(count, generator=rng) < self.boundary_share
         return r.masked_fill(boundary, 0.0), t.masked_fill(boundary, 1.0)

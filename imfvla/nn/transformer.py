@@ -12,6 +12,7 @@
 Shapes: B batch, H steps, A channels, K = H / patch tokens, L context tokens, D width.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
@@ -88,7 +89,8 @@ class TransformerCore(nn.Module):
     """Maps a noisy sequence, its times and a context to a sequence: (x, t, r | context) -> (B, H, A).
 
     `residual` builds the residual from (num_sublayers, width), as the classes of `nn/residual.py` do.
-    `max_rad` is the highest frequency of the time embeddings. `velocity_head` adds a second output layer, `instant`.
+    `max_rad` is the highest frequency of the time embeddings. With `velocity_head` average and instantaneous velocity
+    share the context and have action blocks each of their own (the auxiliary head of arXiv 2512.02012).
     Raises ValueError where `patch` does not divide `steps`.
     """
 
@@ -121,10 +123,14 @@ class TransformerCore(nn.Module):
         self.blocks = nn.ModuleList(self.block(width, heads, mlp_ratio) for _ in range(depth))
         self.residual = residual(self.block.num_sublayers * depth, width)
         self.norm = nn.LayerNorm(width, elementwise_affine=False)
-        self.output = self._output_layer()
-        if velocity_head:
-            self.velocity_output = self._output_layer()
+        self.output = Linear(width, patch * channels)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
         self.interface = "flow and v-head" if velocity_head else "flow"
+        self.average: TransformerCore | None = None
+        if velocity_head:
+            self.average = copy.deepcopy(self)
+            del self.average.summary
 
     def condition(self, context: Tensor) -> Conditioning:
         """Runs the context tokens (B, L, D), of which the last one is a summary, through the stack once."""
@@ -141,11 +147,19 @@ class TransformerCore(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
-        return self.sequence(self.output(self.features(x, t, r, context)))
+        stack = self.average or self
+        return stack.sequence(stack.output(stack.features(x, t, r, context)))
 
     def instant(self, x: Tensor, t: Tensor, context: Conditioning) -> Tensor:
-        """What the velocity head says at r = t (arXiv 2512.02012, appendix): x (B, H, A), t (B,) -> (B, H, A)."""
-        return self.sequence(self.velocity_output(self.features(x, t, t, context)))
+        """What the blocks of the instantaneous velocity say, r = t: x (B, H, A), t (B,) -> (B, H, A)."""
+        return self.sequence(self.output(self.features(x, t, t, context)))
+
+    @torch.no_grad()
+    def start_average(self) -> None:
+        """The blocks of the average velocity take the weights of those of the instantaneous one."""
+        learned = dict(self.named_parameters())
+        for name, parameter in self.average.named_parameters():
+            parameter.copy_(learned[name])
 
     def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """What the output layers read of each action token: (B, K, D)."""
@@ -155,12 +169,6 @@ class TransformerCore(nn.Module):
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
             block(history, prefix)
         return self.norm(history.readout()[:, 2:])
-
-    def _output_layer(self) -> Linear:
-        layer = Linear(self.width, self.patch * self.channels)
-        nn.init.zeros_(layer.weight)
-        nn.init.zeros_(layer.bias)
-        return layer
 
     def patches(self, x: Tensor) -> Tensor:
         """Tokens (B, K, D) of a sequence (B, H, A)."""

@@ -35,6 +35,7 @@ DETAILS = {
     "step": (int,),
     "train_s": (int, float),
     "precision": (str,),
+    "gradient_scale": (float, type(None)),  # None where every step so far was left out
     "batches": (dict,),
     "logger": (dict,),
 }

@@ -1,8 +1,8 @@
 """The training loop: any policy with a loss, batches that are a function of their number, a run directory.
 
 Step i (0-based) takes batch i, random numbers of SeedSequence([seed, stream, i]) and the learning rate of i.
-So the state to resume from is the weights, their average and AdamW's moments, and a resumed run equals an
-uninterrupted one bit for bit (same machine, same number of threads).
+So the state to resume from is the weights, their average, AdamW's moments and the gradients' scale, and a resumed run
+equals an uninterrupted one bit for bit (same machine, same number of threads).
 """
 
 import logging
@@ -23,6 +23,7 @@ from imfvla.progress import Progress
 from imfvla.run_directory import RunDirectory
 from imfvla.signals import Stopped, deferred_stop
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
+from imfvla.training.clipping import Clipping
 from imfvla.training.ema import Ema
 from imfvla.training.logger import MetricsLogger, SilentLogger
 from imfvla.training.non_finite import NonFinite, name_cause
@@ -42,6 +43,8 @@ log = logging.getLogger(__name__)
 class Trainable(Protocol):
     """What the loop asks of a policy, which is also an nn.Module."""
 
+    def first_steps(self, steps: int) -> dict[str, int]: ...
+    def begin_step(self, step: int, steps: int) -> None: ...
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
 
 
@@ -81,21 +84,23 @@ class Trainer:
         self.batches, self.run, self.options, self.optim = batches, run, options, optim
         self.seed, self.description = seed, dict(description)
         self.processes.begin_alike(self.policy)
-        self.ema = Ema(self.policy, optim.ema_decay)
+        later = self.policy.first_steps(options.steps)
+        self.ema = Ema(self.policy, optim.ema_decay, later)
         if options.sharding == FULL:
             shard(self.policy, self.device, loss="loss")
             shard(self.ema.policy, self.device)
-        self.optimiser = make_optimiser(self.policy, optim)
+        self.optimiser = make_optimiser(self.policy, optim, later)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
         self.step = self.saved_step = 0
         self.train_s = 0.0  # spent in this and earlier processes
         self._logger_state: dict[str, Any] | None = None
+        self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
         precision: str | None = None
         if run.last_state.exists():
             details = load_state(run.last_state, self.state)
             self.step = self.saved_step = details["step"]
             self.train_s, self._logger_state = details["train_s"], details["logger"]
-            precision = details["precision"]
+            precision, self.clipping.scale = details["precision"], details["gradient_scale"]
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         precision = precision or choose_precision(options.precision, self.device)
@@ -171,16 +176,11 @@ class Trainer:
         """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
         seed = step_seed(self.seed, self.step)
         torch.manual_seed(seed)  # for dropout and the like, which take no generator
-        rate = learning_rate(
-            self.step,
-            steps=self.options.steps,
-            peak=self.optim.lr,
-            warmup=self.optim.warmup,
-            floor=self.optim.floor,
-        )
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = self._rate(group["first_step"])
         share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
+        for policy in (self.policy, self.ema.policy):
+            policy.begin_step(self.step, self.options.steps)
         with autocast(self.precision, self.device), self.processes.draws(rng, len(share.actions)):
             loss, logs = self.policy.loss(share, rng)
         loss_value, *means = self.processes.mean([loss.item(), *(value.item() for value in logs.values())])
@@ -189,14 +189,32 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.processes.average_gradients(self.policy.parameters())
-        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), self.optim.clip_norm)).item()
+        limit = self.clipping.limit
+        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit)).item()
         if not math.isfinite(norm):
             return self._skip("norm of the gradient", norm, batch)
+        clipped = self.clipping.update(norm)
         self.optimiser.step()
         self.ema.update(self.step)
         self.step += 1
         self.non_finite.in_a_row = 0
-        return {"loss": loss_value, "grad_norm": norm, "lr": rate} | dict(zip(logs, means, strict=True))
+        measured = {
+            "loss": loss_value,
+            "grad_norm": norm,
+            "clipped": clipped,
+            "lr": self.optimiser.param_groups[0]["lr"],
+        }
+        return measured | dict(zip(logs, means, strict=True))
+
+    def _rate(self, first: int) -> float:
+        """The learning rate of this step for parameters whose training begins at step `first`."""
+        return learning_rate(
+            max(0, self.step - first),
+            steps=self.options.steps - first,
+            peak=self.optim.lr,
+            warmup=self.optim.warmup,
+            floor=self.optim.floor,
+        )
 
     def _skip(self, what: str, value: float, batch: Batch) -> None:
         """Leaves the weights as they are. Raises UserError where training is to stop."""
@@ -231,6 +249,7 @@ class Trainer:
             "step": self.step,
             "train_s": self.train_s,
             "precision": self.precision,
+            "gradient_scale": self.clipping.scale,
             "batches": self.batches.state_dict(),
             "logger": logger.state(),
             "code": code_version(),

@@ -33,7 +33,7 @@ class NonFinite:
         if self.wanted == SKIP and self.in_a_row <= MAX_SKIPPED:
             log.warning("Skipped %s; it comes from %s.", where, cause)
             return
-        advice = "Lower optim.lr or optim.clip_norm, or set training.precision=fp32"
+        advice = "Lower optim.lr or optim.clip_factor, or set training.precision=fp32"
         if self.wanted == STOP:
             advice += ", or training.on_non_finite=skip to leave such batches out"
         else:

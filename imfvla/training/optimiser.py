@@ -1,5 +1,8 @@
 """AdamW with weight decay where it belongs: on matrices and kernels."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from torch import nn
 from torch.optim import AdamW
 
@@ -27,18 +30,22 @@ UNDECAYED_MODULES = (
 )
 
 
-def make_optimiser(policy: nn.Module, options: OptimOptions) -> AdamW:
-    """AdamW over all trainable parameters; its rate is set by the loop before each step."""
+def make_optimiser(
+    policy: nn.Module, options: OptimOptions, first_steps: Mapping[str, int] = MappingProxyType({})
+) -> AdamW:
+    """AdamW over all trainable parameters; its rates are set by the loop before each step.
+
+    Parameters of equal decay and equal first step (0 where `first_steps` names none) are a group with a `first_step`.
+    """
     decayed = decayed_parameters(policy)
-    trainable = {name: parameter for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    groups: dict[tuple[int, bool], list[nn.Parameter]] = {}
+    for name, parameter in policy.named_parameters():
+        if parameter.requires_grad:
+            groups.setdefault((first_steps.get(name, 0), name in decayed), []).append(parameter)
     groups = [
-        {
-            "params": [p for name, p in trainable.items() if name in decayed],
-            "weight_decay": options.weight_decay,
-        },
-        {"params": [p for name, p in trainable.items() if name not in decayed], "weight_decay": 0.0},
+        {"params": params, "weight_decay": options.weight_decay if decays else 0.0, "first_step": first}
+        for (first, decays), params in sorted(groups.items(), key=lambda item: (item[0][0], not item[0][1]))
     ]
-    groups = [group for group in groups if group["params"]]
     return AdamW(groups, lr=options.lr, betas=options.betas, eps=options.eps, fused=True)
 
 

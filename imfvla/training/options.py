@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from imfvla.options import Limit, above, at_least, one_of, require, within
+from imfvla.options import SHARE_BELOW_1, above, at_least, one_of, require, within
 from imfvla.training.sharding import SHARDINGS
 
 # Far beyond what is of use: what is larger is a typing error, and would fail late.
 MAX_STEPS, MAX_BATCH, MAX_CHECKPOINTS, MAX_PREFETCH, MAX_THREADS = 10**9, 10**6, 10**4, 1024, 1024
-SHARE_BELOW_1 = Limit("in [0, 1)", lambda value: 0 <= value < 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,5 +55,7 @@ class OptimOptions:
     weight_decay: Annotated[float, at_least(0)]
     warmup: Annotated[float, within(0, 1)]  # share of the steps
     floor: Annotated[float, within(0, 1)]  # share of `lr` at the end
-    clip_norm: Annotated[float, above(0)]
+    # Gradients are clipped at this multiple of their running norm; at 1 or below, that norm would shrink.
+    clip_factor: Annotated[float, above(1)] | None
+    clip_norm: Annotated[float, above(0)] | None  # and at this norm
     ema_decay: Annotated[float, SHARE_BELOW_1]

@@ -1,5 +1,6 @@
 """ACT's objective: the divergence's closed form, style zero in rollouts, and that it learns."""
 
+import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
 
@@ -56,3 +57,28 @@ def test_learns_one_batch():
         optimiser.step()
     error = (generator.sample(core, context, torch.zeros(8, 4, 2), 1) - actions).abs().mean()
     assert error < 0.25 * actions.abs().mean()
+
+
+@pytest.mark.parametrize(("kl_weight", "lives"), [(10.0, False), (0.01, True)])
+def test_a_latent_lives_only_where_its_weight_is_small_against_the_error(kl_weight, lives):
+    """Chunks of all zeros or all ones, half each, from one context: a style can say which, in ln 2 nats.
+
+    That saves half of an action's deviation, a great deal more than the committed error of 0.19 has to give.
+    """
+    torch.manual_seed(0)
+    core, generator = make_core(), ActionChunking(kl_weight=kl_weight, clip=10.0)
+    rng = torch.Generator().manual_seed(0)
+    context, valid = torch.zeros(32, 2, 16), torch.ones(32, 4, dtype=torch.bool)
+    actions = (torch.arange(32) % 2).float().reshape(-1, 1, 1).expand(-1, 4, 2)
+    optimiser = torch.optim.Adam(core.parameters(), lr=5e-3)
+    for _ in range(150):
+        value, logs = generator.loss(core, context, actions, valid, rng)
+        optimiser.zero_grad()
+        value.mean().backward()
+        optimiser.step()
+    if lives:
+        assert logs["divergence"] > 0.69
+        assert logs["absolute_error"] < 0.1
+    else:
+        assert logs["divergence"] < 0.01
+        assert logs["absolute_error"] > 0.4

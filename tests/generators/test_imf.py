@@ -177,6 +177,28 @@ def test_intervals_are_ordered_and_hold_the_share_of_whole_ones(times):
     assert abs(whole - 0.25) < 0.03
 
 
+@pytest.mark.parametrize("parametrisation", ["data", "velocity"])
+def test_the_identity_holds_at_every_time_that_is_drawn(parametrisation):
+    """The data form divides by t, so none is drawn near 0; bounding the division alone would break the identity."""
+
+    class Exact(nn.Module):
+        def forward(self, z, t, r, context):
+            u = GaussianFlow()(z, t, r, context)
+            return u if parametrisation == "velocity" else z - t[:, None, None] * u
+
+    class NearData:
+        def __call__(self, count, rng):
+            return 0.03 * torch.rand(count, generator=rng, dtype=torch.float64)
+
+    gen = generator(parametrisation=parametrisation, times=NearData())
+    r, t = gen.intervals(64, torch.Generator().manual_seed(0))
+    assert (t < 0.021).any()
+    z, _, _ = draw(64)
+    v = gen.velocity(Exact(), z, t, t, None)
+    u, dudt = gen.derivative(Exact(), z, r.to(z), t, v, None)
+    torch.testing.assert_close(u + (t - r)[:, None, None] * dudt, v)
+
+
 def test_high_noise_times_stay_near_one():
     t = HighNoiseTimes()(10_000, torch.Generator().manual_seed(0))
     assert t.min() > 0.02

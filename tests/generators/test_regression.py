@@ -25,6 +25,41 @@ def test_the_loss_is_the_mean_absolute_error_over_valid_steps():
     torch.testing.assert_close(logs["absolute_error"], loss.mean())
 
 
+def test_the_squared_error_is_that_of_the_mean():
+    actions, _, _ = draw(2)
+    valid = torch.ones(2, STEPS, dtype=torch.bool)
+    loss, logs = Regression(clip=10.0, power=2).loss(Constant(), Context(), actions, valid, torch.Generator())
+    torch.testing.assert_close(loss, (actions - MEAN).square().mean((1, 2)))
+    torch.testing.assert_close(logs["squared_error"], loss.mean())
+
+
+@pytest.mark.parametrize(("power", "optimum"), [(1, 0.0), (2, 0.25)])
+def test_the_optimum_is_the_median_or_the_mean(power, optimum):
+    """Of three actions at 0 and one at 1."""
+
+    class Constant(nn.Module):
+        def __init__(self, value):
+            super().__init__()
+            self.value = value
+
+        def forward(self, x, t, r, context):
+            return torch.full_like(x, self.value)
+
+    actions = torch.tensor([0.0, 0.0, 0.0, 1.0]).reshape(4, 1, 1)
+    valid = torch.ones(4, 1, dtype=torch.bool)
+    values = torch.linspace(0, 1, 21).tolist()
+    losses = [
+        Regression(clip=10.0, power=power).loss(Constant(value), None, actions, valid, None)[0].mean()
+        for value in values
+    ]
+    assert values[int(torch.stack(losses).argmin())] == pytest.approx(optimum)
+
+
+def test_another_power_is_refused():
+    with pytest.raises(UserError, match=r"^generator\.power must be 1 or 2, found 3\.$"):
+        Regression(clip=10.0, power=3)
+
+
 def test_the_noise_changes_nothing():
     core, (noise, _, _) = Recorded(), draw(4)
     chunk = Regression(clip=10.0).sample(core, None, noise, 1)
@@ -36,8 +71,9 @@ def test_the_prediction_is_clamped():
     assert torch.equal(chunk, MEAN.clamp(-0.2, 0.2).expand_as(chunk))
 
 
-def test_more_than_one_evaluation_is_refused_in_one_sentence_that_names_both_sides():
+@pytest.mark.parametrize("power", [1, 2])
+def test_more_than_one_evaluation_is_refused_in_one_sentence_that_names_both_sides(power):
     with pytest.raises(
-        UserError, match=r"^nfe, .*, must be 1 with generator=l1 \(one-step regression\), found 3\.$"
+        UserError, match=rf"^nfe, .*, must be 1 with generator=l{power} \(one-step regression\), found 3\.$"
     ):
-        Regression(clip=10.0).sample(Constant(), None, draw(4)[0], 3)
+        Regression(clip=10.0, power=power).sample(Constant(), None, draw(4)[0], 3)

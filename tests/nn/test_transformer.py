@@ -37,11 +37,10 @@ def make_core(residual, conditioning="token", depth=3, dtype=torch.float64, velo
         residual=RESIDUALS[residual],
         velocity_head=velocity_head,
     ).to(dtype)
-    nn.init.normal_(core.output.weight, std=0.3)
-    if velocity_head:
-        nn.init.normal_(core.velocity_output.weight, std=0.3)
-    if residual != "standard":
-        nn.init.normal_(core.residual.query)
+    for stack in (core, core.average) if velocity_head else (core,):
+        nn.init.normal_(stack.output.weight, std=0.3)
+        if residual != "standard":
+            nn.init.normal_(stack.residual.query)
     return core
 
 
@@ -150,6 +149,36 @@ def test_every_parameter_learns(residual, conditioning):
     x, t, r, context = inputs()
     core(x, t, r, core.condition(context)).square().sum().backward()
     assert [name for name, p in core.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+@each_core
+@pytest.mark.parametrize("residual", ["standard", "attnres-attn"])
+def test_both_velocities_have_blocks_of_their_own_and_share_the_context(residual, conditioning):
+    """Each learns all of its own weights, and the average none of those that the instantaneous velocity has."""
+    core = make_core(residual, conditioning, velocity_head=True)
+    x, t, r, context = inputs()
+    cached = core.condition(context)
+    core(x, t, r, cached.detach(x.dtype)).square().sum().backward()
+    own = {name for name, _ in core.average.named_parameters(prefix="average")}
+    assert {name for name, p in core.named_parameters() if p.grad is not None and p.grad.any()} == own
+    core.zero_grad(set_to_none=True)
+    core.instant(x, t, cached).square().sum().backward()
+    assert not own & {name for name, p in core.named_parameters() if p.grad is not None}
+
+
+@each_core
+@each_residual
+def test_the_average_starts_as_the_instantaneous_velocity(residual, conditioning):
+    core = make_core(residual, conditioning, velocity_head=True)
+    x, t, _, context = inputs()
+    cached = core.condition(context)
+    instant = core.instant(x, t, cached)
+    assert not torch.allclose(core(x, t, t, cached), instant)
+    core.start_average()
+    assert torch.equal(core(x, t, t, cached), instant)
+    with torch.no_grad():
+        core.output.weight.zero_()  # copied, not shared
+    assert torch.equal(core(x, t, t, cached), instant)
 
 
 def test_the_first_sublayer_has_one_source_and_its_query_no_gradient():

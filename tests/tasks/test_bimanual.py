@@ -61,7 +61,7 @@ def test_the_start_depends_on_the_seed_alone(env):
 def test_an_episode_repeats_whatever_was_done_before(env):
     def play() -> list[np.ndarray]:
         env.reset(8)
-        expert = make_expert(env.name, modes=2, noise=0.01, hold=18)
+        expert = make_expert(env.name, modes=2, noise=0.01, hold=18, dwell=0)
         expert.reset(env, 8)
         return [env.step(expert.act(env, env.state(), i).executed).observation["state"] for i in range(60)]
 

@@ -47,7 +47,7 @@ def test_the_expert_does_what_the_sentence_says_and_leaves_the_rest():
     env = tasks.load("combined", variant="easy")
     for seed, moved in ((4, {"socket", "peg"}), (5, {"bar"})):
         env.reset(seed)
-        expert = make_expert("combined", modes=1, noise=0.0, hold=18)
+        expert = make_expert("combined", modes=1, noise=0.0, hold=18, dwell=0)
         expert.reset(env, seed)
         before = poses(env)
         for step in range(env.time_limit_steps):

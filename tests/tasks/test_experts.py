@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
+from imfvla.episode import ACTION_NAMES
 from imfvla.errors import UserError
 from imfvla.tasks.experts import make_expert
+from imfvla.tasks.experts.transfer import TransferExpert
 from imfvla.tasks.robot import JOINT_LIMITS
 
 
@@ -23,7 +25,7 @@ def play(env, expert, seed: int) -> tuple[list[int], np.ndarray, list]:
 
 @pytest.mark.parametrize("modes", [1, 2, 4])
 def test_demonstrations_succeed_stage_by_stage(env, modes):
-    expert = make_expert(env.name, modes=modes, noise=0.004, hold=18)
+    expert = make_expert(env.name, modes=modes, noise=0.004, hold=18, dwell=0)
     for seed in (11, 12):
         stages, states, decisions = play(env, expert, seed)
         assert max(stages) == env.success_stage
@@ -45,13 +47,13 @@ def test_demonstrations_succeed_stage_by_stage(env, modes):
 @pytest.mark.parametrize("name", tasks.NAMES)
 def test_other_variants_can_be_solved(name, variant):
     env = tasks.load(name, variant=variant)
-    stages, _, _ = play(env, make_expert(name, modes=2, noise=0.004, hold=18), 3)
+    stages, _, _ = play(env, make_expert(name, modes=2, noise=0.004, hold=18, dwell=0), 3)
     assert max(stages) == env.success_stage
     env.close()
 
 
 def test_the_hidden_mode_is_in_the_style_and_in_nothing_one_could_see(env):
-    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18) for modes in (1, 2))
+    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18, dwell=0) for modes in (1, 2))
     signs = []
     for seed in range(12):
         env.reset(seed)
@@ -71,7 +73,7 @@ def test_the_hidden_mode_is_in_the_style_and_in_nothing_one_could_see(env):
 
 def test_both_ways_of_the_hidden_choice_part_at_once_and_their_mean_is_neither(env):
     """From the same start the right wrist turns a quarter either way."""
-    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18) for modes in (1, 2))
+    one, two = (make_expert(env.name, modes=modes, noise=0.0, hold=18, dwell=0) for modes in (1, 2))
     seed = 0
     while True:
         env.reset(seed)
@@ -87,7 +89,7 @@ def test_both_ways_of_the_hidden_choice_part_at_once_and_their_mean_is_neither(e
 
 
 def test_four_modes_draw_both_arms(socket_env):
-    expert = make_expert("socket", modes=4, noise=0.0, hold=18)
+    expert = make_expert("socket", modes=4, noise=0.0, hold=18, dwell=0)
     seen = set()
     for seed in range(24):
         socket_env.reset(seed)
@@ -97,7 +99,7 @@ def test_four_modes_draw_both_arms(socket_env):
 
 
 def test_noise_is_executed_and_not_recorded(env):
-    expert = make_expert(env.name, modes=2, noise=0.01, hold=18)
+    expert = make_expert(env.name, modes=2, noise=0.01, hold=18, dwell=0)
     env.reset(0)
     expert.reset(env, 0)
     differences = []
@@ -114,7 +116,7 @@ def test_noise_is_executed_and_not_recorded(env):
 
 def test_a_push_is_corrected(env):
     """Thrown off during the approach, the expert still succeeds: what it does follows from what it measures."""
-    expert = make_expert(env.name, modes=2, noise=0.0, hold=18)
+    expert = make_expert(env.name, modes=2, noise=0.0, hold=18, dwell=0)
     env.reset(2)
     expert.reset(env, 2)
     for step in range(env.time_limit_steps):
@@ -126,15 +128,49 @@ def test_a_push_is_corrected(env):
     assert env.stage() == env.success_stage
 
 
+def test_a_hand_that_dwells_closes_later_by_what_was_drawn_and_does_all_else_as_before(transfer_env):
+    at_once, dwelling = (
+        make_expert("transfer", modes=1, noise=0.0, hold=18, dwell=dwell) for dwell in (0, 26)
+    )
+    (plain, _, before), (stages, _, after) = (play(transfer_env, expert, 3) for expert in (at_once, dwelling))
+    wait = dwelling.style.pop("wait")
+    assert at_once.style == dwelling.style
+    assert wait > 5
+    left = ACTION_NAMES.index("left/gripper")
+    closes = [
+        next(i for i, d in enumerate(decisions) if d.action[left] < 0.5) for decisions in (before, after)
+    ]
+    assert closes[1] - closes[0] == wait
+    assert all(np.array_equal(before[i].action, after[i].action) for i in range(closes[0]))
+    assert max(plain) == max(stages) == transfer_env.success_stage
+
+
+def test_the_time_that_a_hand_dwells_is_geometric():
+    """It has no memory: having waited says nothing about how much longer it will take."""
+    expert = TransferExpert(modes=1, noise=0.0, hold=18, dwell=26)
+    waits = np.array([expert.draw_style(np.random.default_rng(seed))["wait"] for seed in range(4000)])
+    assert waits.min() == 1
+    for steps in (8, 16, 48):
+        assert (waits > steps).mean() == pytest.approx((1 - 1 / 26) ** steps, abs=0.025)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"name": "knitting", "modes": 2, "noise": 0.0, "hold": 18}, "no expert for a task 'knitting'"),
         (
-            {"name": "socket", "modes": 3, "noise": 0.0, "hold": 18},
+            {"name": "knitting", "modes": 2, "noise": 0.0, "hold": 18, "dwell": 0},
+            "no expert for a task 'knitting'",
+        ),
+        (
+            {"name": "socket", "modes": 3, "noise": 0.0, "hold": 18, "dwell": 0},
             "task.expert.modes must be 1, 2 or 4, found 3",
         ),
-        ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18}, "task.expert.noise"),
+        ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18, "dwell": 0}, "task.expert.noise"),
+        (
+            {"name": "socket", "modes": 2, "noise": 0.0, "hold": 18, "dwell": 26},
+            "task.expert.dwell must be 0: only the transfer expert waits, found 26",
+        ),
+        ({"name": "transfer", "modes": 2, "noise": 0.0, "hold": 18, "dwell": -1}, "task.expert.dwell"),
     ],
 )
 def test_mistakes_are_named(arguments, message):
@@ -144,4 +180,4 @@ def test_mistakes_are_named(arguments, message):
 
 def test_an_expert_refuses_another_task(transfer_env):
     with pytest.raises(UserError, match="expert of 'socket' was given the task 'transfer'"):
-        make_expert("socket", modes=1, noise=0.0, hold=18).reset(transfer_env, 0)
+        make_expert("socket", modes=1, noise=0.0, hold=18, dwell=0).reset(transfer_env, 0)

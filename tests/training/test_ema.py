@@ -5,6 +5,17 @@ from torch import nn
 from imfvla.training.ema import Ema, decay_at
 
 
+def test_a_parameter_that_begins_later_forgets_what_it_began_with():
+    policy = nn.Linear(1, 1)
+    average = Ema(policy, 0.999, {"weight": 100})
+    with torch.no_grad():
+        policy.weight.fill_(5.0)
+        for step in range(130):
+            average.update(step)
+            assert step >= 100 or average.policy.weight != 5.0
+    torch.testing.assert_close(average.policy.weight, policy.weight, rtol=1e-4, atol=0)
+
+
 def test_decay_rises_to_its_limit():
     assert decay_at(0, 0.999) == 0.1
     assert decay_at(90, 0.999) == 0.91

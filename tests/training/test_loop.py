@@ -10,9 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
-from tiny_policy import CountedBatches, TinyPolicy
+from tiny_policy import ACTION, STATE, STEPS, CountedBatches, TinyPolicy
+from torch import nn
 
 from imfvla.errors import UserError
+from imfvla.generators.base import HighNoiseTimes
+from imfvla.generators.staged import StagedMeanFlow
+from imfvla.nn.residual import StandardResidual
+from imfvla.nn.transformer import TransformerCore
 from imfvla.signals import Stopped
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import choose_device, step_seed
@@ -36,6 +41,40 @@ class DiesAt(TinyPolicy):
             raise self.error
         self.calls -= 1
         return super().loss(batch, rng)
+
+
+class StagedPolicy(nn.Module):
+    """Mean Flow in two stages, of which the second one begins at half-time."""
+
+    def __init__(self, dies_at: int | None = None) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.core = TransformerCore(
+            steps=STEPS, channels=ACTION, width=8, depth=1, heads=2, patch=1, mlp_ratio=2.0, max_rad=10.0,
+            residual=StandardResidual, velocity_head=True,
+        )  # fmt: skip
+        self.encoder = nn.Linear(STATE, 8)
+        self.generator = StagedMeanFlow(
+            parametrisation="data", times=HighNoiseTimes(), velocity_head=True, average_from=0.5, path_steps=2,
+            average_weight=1.0, boundary_share=0.5, time_power=2.0, adaptive_power=0.5, adaptive_offset=1e-3,
+            draws=2, compound_draws=1, clip=10.0,
+        )  # fmt: skip
+        self.dies_at, self.step = dies_at, 0
+
+    def first_steps(self, steps):
+        later = self.generator.first_steps(self.core, steps)
+        return {f"core.{name}": step for name, step in later.items()}
+
+    def begin_step(self, step, steps):
+        self.step = step
+        self.generator.begin_step(self.core, step, steps)
+
+    def loss(self, batch, rng):
+        if self.step == self.dies_at:
+            raise Killed()
+        context = self.core.condition(self.encoder(batch.obs.state))
+        loss, logs = self.generator.loss(self.core, context, batch.actions, batch.valid, rng)
+        return loss.mean(), logs
 
 
 def tensors_of(path: Path) -> dict[str, torch.Tensor]:
@@ -79,6 +118,30 @@ def test_resume_equals_uninterrupted_bit_for_bit(tmp_path, make_trainer, killed_
     assert resumed.step == killed_at
     resumed.train()
     assert_same_run(whole.run, resumed.run)
+
+
+@pytest.mark.parametrize("killed_at", [1, 2, 3])
+def test_resume_across_the_start_of_a_stage_equals_uninterrupted_bit_for_bit(
+    tmp_path, make_trainer, killed_at
+):
+    """Its blocks take the weights of others before step 2, in the policy and in the average of its weights."""
+    whole = make_trainer(tmp_path / "whole", StagedPolicy())
+    whole.train()
+    with pytest.raises(Killed):
+        make_trainer(tmp_path / "resumed", StagedPolicy(dies_at=killed_at)).train()
+    resumed = make_trainer(tmp_path / "resumed", StagedPolicy())
+    assert resumed.step == killed_at
+    resumed.train()
+    assert_same_run(whole.run, resumed.run)
+
+
+def test_the_average_of_the_weights_starts_a_stage_from_its_own(tmp_path, make_trainer):
+    trainer = make_trainer(tmp_path, StagedPolicy(dies_at=2))
+    with pytest.raises(Killed):
+        trainer.train()
+    for core in (trainer.policy.core, trainer.ema.policy.core):
+        assert torch.equal(core.average.output.weight, core.output.weight)
+    assert not torch.equal(trainer.policy.core.output.weight, trainer.ema.policy.core.output.weight)
 
 
 def test_resume_from_an_older_state_repeats_no_row(tmp_path, make_trainer):
@@ -257,7 +320,7 @@ def test_metrics_have_the_documented_columns(tmp_path, make_trainer):
     trainer.train()
     rows = read_metrics(trainer.run.metrics)
     assert [row["step"] for row in rows] == [3, 4]
-    assert set(rows[0]) == {"step", "loss", "error", "grad_norm", "lr", *TIMES}
+    assert set(rows[0]) == {"step", "loss", "error", "grad_norm", "clipped", "lr", *TIMES}
     assert list(trainer.run.tensorboard.glob("events.*"))
 
 

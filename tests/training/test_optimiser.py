@@ -43,3 +43,9 @@ def test_decay_shrinks_what_has_no_gradient_signal():
     for name, parameter in policy.named_parameters():
         factor = 0.95 if name in ("net.0.weight", "net.3.weight") else 1.0
         torch.testing.assert_close(parameter.detach(), factor * before[name])
+
+
+def test_parameters_that_begin_later_have_groups_of_their_own():
+    policy = nn.Linear(2, 2)
+    groups = make_optimiser(policy, OPTIM, {"weight": 7}).param_groups
+    assert [(group["first_step"], len(group["params"])) for group in groups] == [(0, 1), (7, 1)]

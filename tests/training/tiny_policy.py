@@ -32,7 +32,8 @@ OPTIM = OptimOptions(
     weight_decay=1e-2,
     warmup=0.25,
     floor=0.1,
-    clip_norm=1.0,
+    clip_factor=1.1,
+    clip_norm=None,
     ema_decay=0.9,
 )
 
@@ -48,6 +49,12 @@ class TinyPolicy(nn.Module):
         )
         self.query = nn.Parameter(torch.zeros(2, 16))  # never used: AdamW keeps nothing of it
         self.register_buffer("scale", torch.ones(ACTION))
+
+    def first_steps(self, steps: int) -> dict[str, int]:
+        return {}
+
+    def begin_step(self, step: int, steps: int) -> None:
+        pass
 
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         state = batch.obs.state[:, 0]

@@ -54,7 +54,11 @@ def collect(folder: Path, episodes: int) -> None:
     env.model_digest = lambda: "0" * 16
     env.paraphrases = ()
     collection._stage_for = lambda settings: (env, Demonstrator())
-    task = {"name": "fake", "variant": "default", "expert": {"modes": 1, "noise": 0.0, "hold": 18}}
+    task = {
+        "name": "fake",
+        "variant": "default",
+        "expert": {"modes": 1, "noise": 0.0, "hold": 18, "dwell": 0},
+    }
     demos = {"episodes": episodes, "first_seed": 0, "directory": str(folder), "camera_every": 2, "workers": 0}
     demos["frames_directory"] = None
     collection.collect(task, {"views": ["front", "top"], "image_size": [16, 16]}, demos)

@@ -9,10 +9,10 @@ from imfvla.tasks.experts.transfer import TransferExpert
 _EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert, "combined": CombinedExpert}
 
 
-def make_expert(name: str, *, modes: int, noise: float, hold: int) -> Expert:
+def make_expert(name: str, *, modes: int, noise: float, hold: int, dwell: int) -> Expert:
     """The expert of the task `name`; see `Expert` for the rest. UserError on an unknown name."""
     if name not in _EXPERTS:
         raise UserError(
             f"There is no expert for a task {name!r}; choose one of {', '.join(sorted(_EXPERTS))}."
         )
-    return _EXPERTS[name](modes=modes, noise=noise, hold=hold)
+    return _EXPERTS[name](modes=modes, noise=noise, hold=hold, dwell=dwell)

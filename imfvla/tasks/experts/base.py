@@ -76,18 +76,24 @@ class Expert:
             4 both are drawn, independently. Nothing in the observation shows what was drawn.
         noise: standard deviation [rad] of the joint noise that is executed but not recorded as action.
         hold: control steps for which a demonstration goes on after success, so that holding is shown too.
+        dwell: mean of the geometric time [control steps] that the transfer expert waits with its left hand around the
+            bar before it closes; 0 closes at once. Nothing in the observation shows how long it will wait.
     """
 
     task_name: str
+    dwells = False  # whether `dwell` may be above 0
 
-    def __init__(self, *, modes: int, noise: float, hold: int) -> None:
+    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int) -> None:
         if modes not in (1, 2, 4):
             raise UserError(f"task.expert.modes must be 1, 2 or 4, found {modes!r}.")
         if not 0 <= noise <= 0.05:
             raise UserError(f"task.expert.noise is a joint angle [rad] from 0 to 0.05, found {noise!r}.")
         if hold < 1:
             raise UserError(f"task.expert.hold is a number of control steps, at least 1, found {hold!r}.")
-        self.modes, self.noise, self.hold = modes, noise, hold
+        if dwell < 0 or (dwell and not self.dwells):
+            wanted = "at least 0 control steps" if self.dwells else "0: only the transfer expert waits"
+            raise UserError(f"task.expert.dwell must be {wanted}, found {dwell!r}.")
+        self.modes, self.noise, self.hold, self.dwell = modes, noise, hold, dwell
         self.style: dict[str, Any] = {}
         self.hands: dict[str, Hand] = {}
 

@@ -13,10 +13,10 @@ from imfvla.tasks.experts.transfer import TransferExpert
 class CombinedExpert:
     """An `episode.Actor` with the arguments of `Expert`."""
 
-    def __init__(self, *, modes: int, noise: float, hold: int) -> None:
+    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int) -> None:
         self._experts = {
-            "socket": SocketExpert(modes=modes, noise=noise, hold=hold),
-            "transfer": TransferExpert(modes=modes, noise=noise, hold=hold),
+            "socket": SocketExpert(modes=modes, noise=noise, hold=hold, dwell=0),
+            "transfer": TransferExpert(modes=modes, noise=noise, hold=hold, dwell=dwell),
         }
         self._expert = self._experts["socket"]
 

@@ -15,17 +15,22 @@ RETREAT = np.array([0.03, 0, 0.07])  # of the right hand from where it gave the 
 
 class TransferExpert(Expert):
     task_name = "transfer"
+    dwells = True
 
     def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
+        self._in_place = 0  # control steps that the open left hand has been around the bar
         self.meeting = np.array([0.0, 0.0, 0.16]) + rng.uniform(-1, 1, 3) * [0.015, 0.02, 0.015]
         self.give_at = rng.uniform(0.05, 0.07)  # along the bar, from its middle to the right
         self.take_at = rng.uniform(-0.07, -0.05)
+        # Drawn last, so that the rest of the style does not change with it.
+        self.wait = int(rng.geometric(1 / self.dwell)) if self.dwell else 0
         names = ("meeting_x", "meeting_y", "meeting_z")
-        return {
+        style = {
             **dict(zip(names, self.meeting.tolist(), strict=True)),
             "give_at": self.give_at,
             "take_at": self.take_at,
         }
+        return style | {"wait": self.wait} if self.dwell else style
 
     def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
         left, right = self.hands["left"], self.hands["right"]
@@ -68,7 +73,8 @@ class TransferExpert(Expert):
             away = np.clip(max(aside / 0.02, turn / 0.25) - 0.3, 0, 1)
             goal = Pose(take.position + np.array([0, 0, ABOVE * away]), take.rotation)
             ready = left.is_at(take, 0.008, 0.08) or (left.opening < 0.6 and left.is_at(take, 0.02, 0.3))
-            left.move(goal, 0.0 if ready else 1.0, TAKE_SPEED)
+            self._in_place += ready
+            left.move(goal, 0.0 if ready and self._in_place > self.wait else 1.0, TAKE_SPEED)
         else:
             rotation = about_z(self.turn["left"] * np.pi / 2)
             left.move(Pose(self.meeting + np.array([self.take_at, 0, ABOVE]), rotation), 1.0, self.speed)
