@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from imfvla.figures.style import (
     BLACK,
     BLUE,
-    CYCLE,
+    GREEN,
     GREY,
     ORANGE,
     PALE,
+    PURPLE,
     SKY,
     VERMILION,
     WIDTH,
@@ -21,13 +22,15 @@ from imfvla.figures.style import (
     style,
 )
 
+BROWN = "#7a5230"
 FATE_COLORS = {
     "closes": BLUE, "holds on": SKY, "waits": PALE, "lets go": ORANGE, "between": VERMILION,
 }  # fmt: skip
 FATE_NAMES = {
-    "closes": "closes", "holds on": "closes, never lets go", "waits": "waits", "lets go": "lets go too early",
+    "closes": "closes", "holds on": "closes, lets go too late", "waits": "waits", "lets go": "lets go too early",
     "between": "neither open nor closed",
 }  # fmt: skip
+LINES = (GREEN, PURPLE, BROWN, GREY)  # of numbers of evaluations: colours that no fate has
 ROW_HEIGHT = 2.7  # inches
 FEWEST_BARS = 3  # that a panel has room for, so that one alone is not a block
 
@@ -50,7 +53,11 @@ def modes_figure(measured: Mapping[str, Any], title: str) -> Figure:
 
 
 def _look(index: int) -> dict[str, Any]:
-    return {"color": BLACK, "linewidth": 2.2} if index == 0 else {"color": CYCLE[index - 1], "linewidth": 1.3}
+    """Of row `index`, the demonstrations first."""
+    if index == 0:
+        return {"color": BLACK, "linewidth": 2.2}
+    again, color = divmod(index - 1, len(LINES))
+    return {"color": LINES[color], "linewidth": 1.3, "linestyle": ("-", "--", ":")[again % 3]}
 
 
 def _label(name: str) -> str:
@@ -125,7 +132,12 @@ def _spread(measured: Mapping[str, Any], left: Axes, right: Axes) -> None:
         (right, "jump_rad", 3, "disagreement of shared steps [rad]", "Jumps between consecutive chunks"),
     ):
         values = [np.nan if row[key] is None else row[key] for row in rows.values()]
-        bars = axes.barh(range(len(rows)), values, height=0.6, color=CYCLE[: len(rows)])
+        bars = axes.barh(
+            range(len(rows)),
+            values,
+            height=0.6,
+            color=[_look(index + 1)["color"] for index in range(len(rows))],
+        )
         axes.bar_label(bars, fmt=f"%.{digits}f", padding=2, fontsize=8)
         _name_bars(axes, list(rows))
         axes.margins(x=0.15)

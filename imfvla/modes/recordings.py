@@ -126,5 +126,7 @@ def _failed_seeds(directory: Path) -> set[int]:
     path = directory / LOG_NAME
     if not path.exists():
         return set()
-    found = read_json(path, "restore it, or take it away", mapping=True).get("failed_seeds", [])
-    return set(found) if isinstance(found, list) else set()
+    failed = read_json(path, "restore it, or take it away", mapping=True).get("failed_seeds")
+    if not isinstance(failed, list) or not all(isinstance(seed, int) for seed in failed):
+        raise UserError(f"{path} must list failed_seeds, found {failed!r}: restore it, or take it away.")
+    return set(failed)
