@@ -78,7 +78,10 @@ class Stops:
         )
         last = len(episode.action) - self._horizon.pred
         pairs = [step for step in usable if step + self.gap in usable and step + self.gap <= last]
-        pairs = pairs[:: max(len(pairs) // self._pairs_each, 1)][: self._pairs_each]
+        # By chance, since evenly from the first one on would weigh the starts, which are unlike the rest.
+        pairs = sorted(
+            np.random.default_rng(episode.info.seed).permutation(pairs)[: self._pairs_each].tolist()
+        )
         self._add(self.before, episode, pairs)
         self._add(self.after, episode, [step + self.gap for step in pairs])
         event = event_of(episode.action)
