@@ -117,13 +117,11 @@ def collect(
     options, settings = _read(task, observation, demos, where)
     _stage_for(settings)  # what cannot be simulated is told before anything is written
     began = time.perf_counter()
-    height, width = settings.image_size
-    waiting = f"-dwell{settings.dwell}" if settings.dwell else ""
-    name = f"{settings.task}-{settings.variant}-modes{settings.modes}{waiting}-{height}x{width}"
+    name = folder_name(settings)
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may want the same demonstrations
         listed = _Log(directory, settings)
-        on_file = _seeds_on_file(directory) - listed.failed
+        on_file = recorded_seeds(directory) - listed.failed
         _name_others(directory, on_file)
         usable = {seed for seed in on_file if options.first_seed <= seed < SEED_LIMIT}
         chosen = {seed for seed in usable if _is_recorded(directory, seed, settings)}
@@ -133,7 +131,7 @@ def collect(
         num_failed = sum(options.first_seed <= seed <= wanted[-1] for seed in listed.failed)
         if len(wanted) < len(on_file | chosen):
             name = f"{name}-seeds{options.first_seed}-n{options.episodes}"
-    names = [_path(directory, seed).name for seed in wanted]
+    names = [recording_path(directory, seed).name for seed in wanted]
     return Report(Recordings.named(directory, names, name), num_new, num_failed, time.perf_counter() - began)
 
 
@@ -207,7 +205,7 @@ def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> lis
 def record_demonstration(settings: Settings, directory: Path, seed: int) -> tuple[int, bool]:
     """Plays the expert from `seed` into its file; of a failed demonstration no file is left. Runs in a worker."""
     env, expert = _stage_for(settings)
-    path = _path(directory, seed)
+    path = recording_path(directory, seed)
     # Until it has succeeded: a kill must not leave a failure under its name.
     trial = path.with_suffix(".mcap.trial")
     sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
@@ -284,18 +282,27 @@ class _Log:
         write_json(self._path, {"settings": self._settings, "failed_seeds": sorted(self.failed)})
 
 
-def _path(directory: Path, seed: int) -> Path:
+def folder_name(settings: Settings) -> str:
+    """The folder of demonstrations with these settings."""
+    height, width = settings.image_size
+    waiting = f"-dwell{settings.dwell}" if settings.dwell else ""
+    return f"{settings.task}-{settings.variant}-modes{settings.modes}{waiting}-{height}x{width}"
+
+
+def recording_path(directory: Path, seed: int) -> Path:
+    """Where a folder has the demonstration of `seed`."""
     return directory / f"episode-{seed:06d}.mcap"
 
 
-def _seeds_on_file(directory: Path) -> set[int]:
+def recorded_seeds(directory: Path) -> set[int]:
+    """The seeds of which a folder has files, whole or not."""
     found = (re.fullmatch(r"episode-(\d{6})\.mcap", path.name) for path in directory.glob("*.mcap"))
     return {int(match.group(1)) for match in found if match}
 
 
 def _name_others(directory: Path, seeds: set[int]) -> None:
     """Says which recordings of the folder are not those of `seeds`."""
-    ours = {_path(directory, seed) for seed in seeds}
+    ours = {recording_path(directory, seed) for seed in seeds}
     if others := sorted(path.name for path in directory.glob("*.mcap") if path not in ours):
         log.warning(
             f"{directory} holds files that are no demonstrations of its collection and are not used: "
@@ -305,7 +312,7 @@ def _name_others(directory: Path, seeds: set[int]) -> None:
 
 def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:
     """Whether the recording of `seed` is whole; UserError where its file holds another episode."""
-    path = _path(directory, seed)
+    path = recording_path(directory, seed)
     try:
         info = read_index(path).info
     except TruncatedRecording:

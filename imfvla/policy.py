@@ -74,10 +74,16 @@ class Policy(nn.Module):
             )
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
-        """Action chunks (B, Tp, A) in physical units from noise (B, Tp, A) and `nfe` evaluations of the core."""
-        context = self.core.condition(self.encoder(obs))
-        chunk = self.generator.sample(self.core, context, noise, nfe)
-        return self.chunks.denormalise(chunk, obs.state[:, -1])
+        """Action chunks (K B, Tp, A) in physical units from noise (K B, Tp, A) and `nfe` evaluations of the core.
+
+        Each observation is encoded once and serves K rows of noise that lie side by side.
+        """
+        tokens, state = self.encoder(obs), obs.state[:, -1]
+        draws = len(noise) // len(state)
+        if draws > 1:
+            tokens, state = tokens.repeat_interleave(draws, 0), state.repeat_interleave(draws, 0)
+        chunk = self.generator.sample(self.core, self.core.condition(tokens), noise, nfe)
+        return self.chunks.denormalise(chunk, state)
 
 
 def hold_last(actions: Tensor, valid: Tensor) -> Tensor:

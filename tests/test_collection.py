@@ -35,7 +35,7 @@ def played(monkeypatch):
         seeds.append(seed)
         if seed in (1, 4):
             return seed, False
-        collection._path(directory, seed).write_bytes(b"episode")
+        collection.recording_path(directory, seed).write_bytes(b"episode")
         return seed, True
 
     monkeypatch.setattr(collection, "record_demonstration", record)

@@ -164,6 +164,15 @@ def test_predictions_lie_in_the_range_of_the_demonstrated_actions(nfe):
     assert not torch.equal(chunk[0], chunk[1])
 
 
+def test_rows_of_noise_share_the_observation_that_they_lie_beside():
+    made, data = policy(), batch()
+    noise = torch.randn(6, *made.noise_shape, generator=torch.Generator().manual_seed(2))
+    with torch.inference_mode():
+        together = made.predict(data.obs, noise, 2)
+        apart = torch.stack([made.predict(data.obs, noise[k::2], 2) for k in range(2)], dim=1)
+    assert torch.allclose(together, apart.flatten(0, 1), atol=1e-5)
+
+
 def test_a_policy_without_statistics_predicts_nothing_that_looks_valid():
     made, data = policy(statistics=None), batch()
     assert made.predict(data.obs, torch.zeros(3, 8, 16), 1).isnan().all()

@@ -104,6 +104,20 @@ MAY_IMPORT = {
     "recording": {"documents", "episode", "files"},
     "reporting": {"documents", "episode", "files", "options", "protocol", "run_directory"},
     "figures": {"documents", "reporting"},
+    "modes": {
+        "torch",
+        "collection",
+        "documents",
+        "episode",
+        "files",
+        "horizon",
+        "instruction",
+        "policy",
+        "progress",
+        "recording",
+        "reporting",
+        "types",
+    },
     "data": {"torch", "documents", "files", "horizon", "instruction", "recording", "statistics", "types"},
 }
 

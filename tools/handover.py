@@ -3,6 +3,7 @@
 python tools/handover.py runs/transfer_ph32_exec16/default
 
 The expert lets 4 control steps pass. Prints successes and failures by that number; "-" where a hand did neither.
+What single samples do at recorded observations says tools/modes.py.
 """
 
 from imfvla.command import as_command, begin
@@ -18,14 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from imfvla.actor import ChunkActor
-from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult, Step
+from imfvla.episode import EpisodeInfo, EpisodeResult, Step
+from imfvla.modes.grippers import release_delay
 from imfvla.progress import Progress
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
 from imfvla.workbench import load_workbench
-
-LEFT, RIGHT = (ACTION_NAMES.index(f"{arm}/gripper") for arm in ("left", "right"))  # 0 is closed, 1 open
-MIDDLE = 0.5
 
 
 class ActionLog:
@@ -39,20 +38,6 @@ class ActionLog:
 
     def end(self, result: EpisodeResult) -> None: ...
     def abort(self) -> None: ...
-
-
-def release_delay(actions: np.ndarray) -> int | None:
-    """Steps from the left gripper's closing to the right one's opening in actions (T, 16); None without either.
-
-    Counted from the right one's first closing, since both begin open.
-    """
-    closed = actions < MIDDLE
-    held = np.flatnonzero(closed[:, RIGHT])
-    if not len(held):
-        return None
-    left = np.flatnonzero(closed[held[0] :, LEFT])
-    right = np.flatnonzero(~closed[held[0] :, RIGHT])
-    return int(right[0] - left[0]) if len(left) and len(right) else None
 
 
 @as_command

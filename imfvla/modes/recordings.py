@@ -1,0 +1,132 @@
+"""Which recordings samples are judged on: demonstrations of the run's own task that it was not trained on."""
+
+from collections.abc import Mapping
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+from imfvla.collection import (
+    LATER_SETTINGS,
+    LOG_NAME,
+    Settings,
+    folder_name,
+    read_options,
+    record_demonstration,
+    recorded_seeds,
+    recording_path,
+)
+from imfvla.documents import read_json
+from imfvla.errors import UserError
+from imfvla.files import locked
+from imfvla.progress import Progress
+from imfvla.recording import Episode, read_episode
+
+SELECTION_FIRST_SEED, REPORTING_FIRST_SEED = 10_000, 100_000
+MOST_FAILURES = 20  # of the expert, before it is given up
+# What a recording must share with the run. Its noise, and the time held after success, may differ.
+SHARED = ("task", "variant", "modes", "dwell", "image_size")
+REMEDY = "leave --demos out to have the expert play"
+
+
+def settings_of(config: Mapping[str, Any]) -> Settings:
+    """How the demonstrations of a run were recorded, also of one that is older than some of the settings."""
+    task, demos = config["task"], config["demos"]
+    task = {**task, "expert": LATER_SETTINGS | task["expert"]}
+    _, settings = read_options(task, config["observation"], {"frames_directory": None} | demos)
+    return settings
+
+
+def trained_seeds(config: Mapping[str, Any], failed: set[int]) -> set[int]:
+    """The seeds of the demonstrations of a run; `failed` are those at which the expert did not succeed."""
+    seeds = (seed for seed in count(config["demos"]["first_seed"]) if seed not in failed)
+    return set(islice(seeds, config["demos"]["episodes"]))
+
+
+def record_starts(config: Mapping[str, Any], directory: Path, first_seed: int, episodes: int) -> list[Path]:
+    """Plays the expert of a run from `first_seed` on until so many have succeeded; what is there is kept.
+
+    The recordings lie in a folder of `directory` that is named as those of demonstrations are.
+    """
+    settings = settings_of(config)
+    if first_seed >= REPORTING_FIRST_SEED:
+        raise UserError(
+            f"--first-seed must be below {REPORTING_FIRST_SEED}: the starts from there on are for reporting, found "
+            f"{first_seed}."
+        )
+    _refuse_trained(first_seed, trained_seeds(config, set()))
+    folder = directory / folder_name(settings)
+    found: list[Path] = []
+    with locked(folder), Progress("recorded starts", episodes) as bar:
+        for seed in range(first_seed, first_seed + episodes + MOST_FAILURES):
+            path = recording_path(folder, seed)
+            if path.exists() or record_demonstration(settings, folder, seed)[1]:
+                found.append(path)
+                bar.advance()
+            if len(found) == episodes:
+                return found
+    raise UserError(
+        f"The expert of {settings.task} succeeded from {len(found)} of {episodes + MOST_FAILURES} seeds only, from "
+        f"{first_seed} on: choose others with --first-seed."
+    )
+
+
+def choose_recordings(
+    config: Mapping[str, Any], directory: Path, first_seed: int | None, episodes: int
+) -> list[Path]:
+    """The first recordings of a folder, from `first_seed` on, that the run was not trained on.
+
+    Raises UserError where the folder has none, and where `first_seed` is one that the run was trained on.
+    """
+    seeds = sorted(recorded_seeds(directory))
+    if not seeds:
+        raise UserError(
+            f"No demonstrations (episode-<seed>.mcap) in {directory}: correct --demos, or {REMEDY}."
+        )
+    trained = trained_seeds(config, _failed_seeds(directory))
+    if first_seed is not None:
+        _refuse_trained(first_seed, trained)
+    usable = [seed for seed in seeds if seed not in trained and seed >= (first_seed or 0)]
+    if not usable:
+        lowest = "" if first_seed is None else f" from seed {first_seed} on"
+        raise UserError(
+            f"{directory} has no demonstration{lowest} that the run was not trained on: it has seeds {seeds[0]} to "
+            f"{seeds[-1]}, trained on were {min(trained)} to {max(trained)}. Record more, or {REMEDY}."
+        )
+    return [recording_path(directory, seed) for seed in usable[:episodes]]
+
+
+def read_demonstration(path: Path, settings: Settings) -> Episode:
+    """A recording with the run's views. Raises UserError where it is of another task, expert or picture size."""
+    episode = read_episode(path, images=settings.views)
+    if episode.info.kind != "demonstration":
+        raise UserError(f"{path} must be a demonstration, found a {episode.info.kind}: correct --demos.")
+    recorded = LATER_SETTINGS | dict(episode.info.config)
+    recorded |= {"task": episode.info.task, "image_size": list(episode.info.image_size)}
+    for key in SHARED:
+        wanted = getattr(settings, key)
+        wanted = list(wanted) if isinstance(wanted, tuple) else wanted
+        if recorded.get(key, wanted) != wanted:
+            raise UserError(
+                f"{path} was recorded with {key}={recorded[key]!r}, the run is of {key}={wanted!r}: choose "
+                f"demonstrations of the run's own task, or {REMEDY}."
+            )
+    return episode
+
+
+def _refuse_trained(first_seed: int, trained: set[int]) -> None:
+    if first_seed in trained:
+        raise UserError(
+            f"--first-seed must be one that the run was not trained on, found {first_seed}: trained on were "
+            f"{min(trained)} to {max(trained)}."
+        )
+
+
+def _failed_seeds(directory: Path) -> set[int]:
+    """The seeds that a collection lists as failed; none where the folder has no list."""
+    path = directory / LOG_NAME
+    if not path.exists():
+        return set()
+    failed = read_json(path, "restore it, or take it away", mapping=True).get("failed_seeds")
+    if not isinstance(failed, list) or not all(isinstance(seed, int) for seed in failed):
+        raise UserError(f"{path} must list failed_seeds, found {failed!r}: restore it, or take it away.")
+    return set(failed)
