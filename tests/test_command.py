@@ -83,7 +83,7 @@ def test_a_stop_while_modules_are_imported_ends_in_one_sentence(run, tmp_path, p
         body = "pass\n\nimport slow"
     done = run(body)
     assert done.returncode == code
-    assert done.stderr in (b"Interrupted.\n", b"Stopped by SIGTERM; the same command goes on.\n")
+    assert done.stderr in (b"Interrupted.\n", b"Stopped by SIGTERM; rerun the same command to resume.\n")
 
 
 def test_a_stop_that_a_library_turns_into_an_error_is_a_stop(capsys):
@@ -95,7 +95,7 @@ def test_a_stop_that_a_library_turns_into_an_error_is_a_stop(capsys):
             raise ImportError("initialization failed") from None
 
     assert main() == 143
-    assert capsys.readouterr().err == "Stopped by SIGTERM; the same command goes on.\n"
+    assert capsys.readouterr().err == "Stopped by SIGTERM; rerun the same command to resume.\n"
 
 
 def failing(error, cause=None):

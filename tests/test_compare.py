@@ -1,4 +1,4 @@
-"""Two runs against each other: what is told of them, the files that are written, and what is refused."""
+"""Two runs against each other: what is said about them, the files that are written, and what is refused."""
 
 from pathlib import Path
 
@@ -137,7 +137,7 @@ def test_the_command_writes_its_files_and_prints_the_verdict(runs, tmp_path, cap
         (["{a}"], "compare needs two run directories, found 1"),
         (["{a}", "{a}"], "is given twice: wanted two runs"),
         (["{a}", "{tmp}"], "is not a run directory"),
-        (["{a}", "{b}", "nfe=1,2,3"], "nfe must be one number, or one of each run"),
+        (["{a}", "{b}", "nfe=1,2,3"], "nfe must be one number, or one for each run"),
         (["{a}", "{cut}"], "episodes.jsonl, line 20 is cut off"),
     ],
 )

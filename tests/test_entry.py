@@ -20,7 +20,7 @@ def command(config):
     if config["seed"] == 1:
         raise UserError("seed 1 is bad.")
     if config["seed"] == 2:
-        raise ZeroDivisionError("a slip of ours")
+        raise ZeroDivisionError("a mistake of ours")
     if config["seed"] == 3:
         raise KeyboardInterrupt
     if config["seed"] == 7:
@@ -47,13 +47,13 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
         (["+exp=nope"], 2, None),
         (["seed=3"], 130, "Interrupted.\n"),
         (["seed=102"], 130, "Interrupted.\n"),
-        (["seed=115"], 143, "Stopped by SIGTERM; the same command goes on.\n"),
-        (["seed=110"], 138, "Stopped by SIGUSR1; the same command goes on.\n"),
+        (["seed=115"], 143, "Stopped by SIGTERM; rerun the same command to resume.\n"),
+        (["seed=110"], 138, "Stopped by SIGUSR1; rerun the same command to resume.\n"),
         (
             ["seed=7"],
             2,
-            "Too many open files at data.bin: no file handle is left, raise the limit with ulimit -n 4096; run the "
-            "same command again.\n",
+            "Too many open files at data.bin: no file handle is left; raise the limit with ulimit -n 4096; rerun "
+            "the same command.\n",
         ),
     ],
 )
@@ -89,7 +89,7 @@ def test_our_own_mistakes_show_a_traceback(capfd):
     assert exit_.value.code == 1
     printed = capfd.readouterr().err
     assert "Traceback" in printed
-    assert "a slip of ours" in printed
+    assert "a mistake of ours" in printed
 
 
 def test_unknown_override_makes_no_directory(tmp_path):
@@ -132,6 +132,6 @@ def test_a_name_that_is_a_path_is_refused_before_a_directory_is_made(tmp_path, c
     with pytest.raises(SystemExit) as exit_:
         command([f"name='{name}'"])
     assert exit_.value.code == 2
-    assert "name must have letters, digits" in capfd.readouterr().err
+    assert "name must consist of letters, digits" in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert not (tmp_path.parent / "escaped").exists()

@@ -1,4 +1,4 @@
-"""Evaluations: equal seeds give equal bytes, a killed one goes on, a finished one is left alone."""
+"""Evaluations: equal seeds give equal bytes, a killed one resumes, a finished one is left alone."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Sweeps: what their files ask for, that a killed one goes on, and that one failure ends no other job."""
+"""Sweeps: what their files ask for, that a killed one resumes, and that one failure ends no other job."""
 
 import json
 from functools import cache

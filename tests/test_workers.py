@@ -46,7 +46,7 @@ def test_in_this_process_work_is_done_one_by_one():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        ((os._exit, (1,)), r"ended \(exit code 1\), 3 times .*: its own last words are printed above"),
+        ((os._exit, (1,)), r"ended \(exit code 1\), 3 times .*: its own last output is printed above"),
         ((signal.raise_signal, (9,)), r"was killed \(SIGKILL\), 3 times .* choose fewer workers"),
         ((signal.raise_signal, (11,)), r"crashed \(SIGSEGV\), 3 times .* export MUJOCO_GL=osmesa"),
     ],
