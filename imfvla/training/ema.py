@@ -21,7 +21,7 @@ class Ema:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Takes the weights after update `step` (0-based) in."""
+        """Averages in the weights after update `step` (0-based)."""
         averages, currents = list(self.policy.parameters()), list(self._source.parameters())
         torch._foreach_lerp_(averages, currents, 1 - decay_at(step, self.limit))
         for averaged, current in zip(self.policy.buffers(), self._source.buffers(), strict=True):
