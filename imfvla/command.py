@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TextIO
 
-from imfvla.errors import UserError, told
+from imfvla.errors import UserError, as_user_error
 from imfvla.signals import Stopped, StopRequest, stop_at_once, stoppable
 
 EXIT_FAILURE, EXIT_USER_ERROR = 1, 2
@@ -49,7 +49,7 @@ def as_command(function: Callable[P, int | None]) -> Callable[P, int]:
         except KeyboardInterrupt:
             request.number = signal.SIGINT
         except Exception as error:
-            known = told(error)
+            known = as_user_error(error)
             if request.number is None and known is None:
                 raise
             if request.number is None:

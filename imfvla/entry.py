@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from imfvla import composition
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
 from imfvla.command_line import in_hydras_words, multiplies, refuse_ignored
-from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, told
+from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
 from imfvla.jobs import Failure, Job
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
@@ -84,7 +84,7 @@ def _run(
     except (HydraException, OmegaConfBaseException) as error:
         raise composition.explain(error, job.config_name, known.overrides) from error
     except (OSError, ValueError) as error:  # ours, and of what Hydra itself writes: directories, train.log
-        if (known_error := told(error, REMEDIES | WHERE_MISSING)) is None:
+        if (known_error := as_user_error(error, REMEDIES | WHERE_MISSING)) is None:
             raise
         raise known_error from error
     return _report(failures)

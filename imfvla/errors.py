@@ -34,7 +34,7 @@ REMEDIES = {
 WHERE_MISSING = {errno.ENOENT: "check that its parent directories exist"}
 
 
-def told(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
+def as_user_error(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
     """A UserError itself, or one for a system error or for an error that it caused; None for other errors."""
     if isinstance(error, UserError):
         return error

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
-from imfvla.errors import UserError, told
+from imfvla.errors import UserError, as_user_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Failure:
     def of(cls, error: Exception, config_name: str, overrides: str) -> "Failure":
         if isinstance(error, HydraException | OmegaConfBaseException):
             error = composition.explain(error, config_name, overrides.split())
-        known = told(error)
+        known = as_user_error(error)
         if known is not None:
             return cls(overrides, str(known), True)
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)

@@ -57,7 +57,7 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
         ),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
+def test_mistakes_are_reported_in_one_line(arguments, code, words, capfd):
     with pytest.raises(SystemExit) as exit_:
         command(arguments)
     printed = capfd.readouterr().err
@@ -68,7 +68,7 @@ def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
 
 @pytest.mark.parametrize("mode", [[], ["-m"]])
 @pytest.mark.parametrize("in_the_way", ["runs", "runs/x/seed=5/train.log"])
-def test_what_hydra_cannot_write_is_told_in_one_line(tmp_path, capfd, mode, in_the_way):
+def test_what_hydra_cannot_write_is_reported_in_one_line(tmp_path, capfd, mode, in_the_way):
     (tmp_path / in_the_way).parent.mkdir(parents=True, exist_ok=True)
     if in_the_way == "runs":
         (tmp_path / in_the_way).write_text("no directory")
@@ -113,7 +113,7 @@ def test_leaves_the_environment_as_it_was():
     assert sys.argv == arguments
 
 
-def test_train_command_tells_a_slip_in_one_line(tmp_path):
+def test_train_command_reports_a_mistake_in_one_line(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "imfvla.train", "+exp=nope"],
         capture_output=True,

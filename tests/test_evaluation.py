@@ -87,7 +87,7 @@ def test_workers_change_nothing(run):
     assert untimed_lines(run.rollouts(NAME)) == here
 
 
-def test_a_killed_evaluation_goes_on_where_it_stopped(run, monkeypatch):
+def test_a_killed_evaluation_resumes_where_it_stopped(run, monkeypatch):
     roll(run)
     uninterrupted = untimed_lines(run.rollouts(NAME))
     played: list[int] = []

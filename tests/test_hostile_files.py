@@ -160,7 +160,7 @@ def test_a_run_directory_of_a_stranger_runs_nothing(tmp_path):
 
 
 PICKLERS = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "pandas"}
-# Calls that read or write pickles, or run text, beside those modules. `np.load` does unless it is told not to.
+# Calls that read or write pickles, or run text, beside those modules. `np.load` does unless it is forbidden to.
 FORBIDDEN_CALLS = {
     "torch.load",
     "torch.save",

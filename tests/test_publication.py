@@ -120,7 +120,7 @@ def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrender
         (lambda runs: answer_row(runs, ROWS["socket_act"], variant="hard"), r"Table 1 mixes protocols: variant is"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_the_runs_is_told_and_nothing_written(
+def test_what_is_wrong_with_the_runs_is_reported_and_nothing_written(
     runs, tmp_path, method, unrendered, damage, message
 ):
     damage(runs)
@@ -135,7 +135,7 @@ def cut(runs: Path, name: str, keep: str | None = None) -> None:
     path.write_text(path.read_text()[:-20] if keep is None else keep)
 
 
-def test_an_unknown_row_is_told_and_nothing_written(runs, tmp_path):
+def test_an_unknown_row_is_reported_and_nothing_written(runs, tmp_path):
     mapping = tmp_path / "tables.yaml"
     mapping.write_text(PATH.read_text().replace("ACT (action chunking)", "ACT (chunking)"))
     command = [sys.executable, "-m", "imfvla.report", f"directories=[{runs}]", f"output={tmp_path / 'out'}"]
@@ -150,7 +150,7 @@ def test_an_unknown_row_is_told_and_nothing_written(runs, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_run_at_all_is_told(tmp_path, method):
+def test_no_run_at_all_is_reported(tmp_path, method):
     make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
     with pytest.raises(UserError, match=r"No run with a finished evaluation below .*make one with"):
         publish([tmp_path / "runs", tmp_path / "nothing"], tmp_path / "out", MAPPING, method)

@@ -51,7 +51,7 @@ def test_in_this_process_work_is_done_one_by_one():
         ((signal.raise_signal, (11,)), r"crashed \(SIGSEGV\), 3 times .* export MUJOCO_GL=osmesa"),
     ],
 )
-def test_the_death_of_a_worker_is_told_with_its_reason_and_the_remedy(call, words):
+def test_the_death_of_a_worker_is_reported_with_its_reason_and_the_remedy(call, words):
     function, arguments = call
     with pytest.raises(UserError, match=words), worker_pool(1) as run_all:
         list(run_all(function, [arguments]))
