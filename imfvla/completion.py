@@ -29,7 +29,7 @@ PROTOCOL_KEYS = (
 def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
     """Whether this config's run is done there, with every evaluation that the config asks for.
 
-    False where its files cannot be read: rerunning it then reports why.
+    False where its files cannot be read: running it then reports why.
     """
     try:
         step = RunDirectory(directory).weights_step(config["evaluation"]["checkpoint"])

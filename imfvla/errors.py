@@ -15,7 +15,7 @@ _SPACE = "free some space there"
 _PERMISSION = "check who may read and write there, or choose another directory"
 _IN_THE_WAY = "remove what has that name, or choose another directory"
 _DEVICE = "check that disk or network"
-# What the user can do about a system error. A missing file is not one: only its reader knows what that means.
+# What the user can do about a system error. A missing file is not listed: only its reader knows what it means.
 REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,

@@ -59,7 +59,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         elif isinstance(record, Metadata):
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment) and record.name == messages.CONFIG_ATTACHMENT:
-            config = parse_json(record.data)  # attachments are never written, so their names are no paths
+            config = parse_json(record.data)  # never extracted, so its name is no path
     for name in messages.RECORDS:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")

@@ -23,7 +23,7 @@ class McapSink:
     """An `episode.Sink` that writes `path` with the topics of `imfvla.recording.messages`.
 
     Frames are those that the actor saw (`Decision.images`); with `render_every`, steps divisible by
-    it that have no frames get those of `env.look()`. They are PNG if `lossless`, as training wants
+    it that have no frames get those of `env.look()`. They are PNG if `lossless`, as training needs
     them, else JPEG. `begin` expects `env` after its reset and `step` after the action, so the
     frames and body poses that the simulator shows then belong to the next step and are kept until it
     comes.
