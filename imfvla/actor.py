@@ -18,7 +18,7 @@ from imfvla.protocol import USUAL_NOISE
 from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.types import Observation
 
-# A sound policy misses the joint limits by little and is clipped; one that misses them by this many range
+# A sound policy exceeds the joint limits slightly and is clipped; one that exceeds them by this many range
 # widths has diverged, and clipping would only hide it.
 FAR = 10.0
 
@@ -26,9 +26,9 @@ FAR = 10.0
 class ChunkActor:
     """Plays a policy in closed loop: an `episode.Actor` that replans every `horizon.exec` control steps.
 
-    Cameras are looked at only in the steps that enter a decision. The noise of replanning k in the
-    episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so every policy with equal
-    chunks sees the same noise. It is multiplied by `noise_scale`.
+    Cameras are rendered only at the steps that enter a decision. The noise of replanning k in the
+    episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so all policies with chunks of
+    the same shape see the same noise. It is multiplied by `noise_scale`.
     """
 
     def __init__(

@@ -55,14 +55,14 @@ class BenchOptions:
 
 @entry_point("bench")
 def main(config: dict[str, Any]) -> None:
-    """Prints the tables of the wanted parts, and all figures as one line of JSON, which comes last."""
+    """Prints the tables of the requested parts, then all figures as one line of JSON."""
     build(BenchOptions, config, "")
     parts = config["parts"]
     GlobalHydra.instance().clear()  # the experiments are composed below
     result: dict[str, Any] = {}
     counted = experiments(config["sizes_of"], "sizes_of") if "sizes" in parts else []
     measured = experiments(config["experiments"], "experiments") if set(parts) != {"sizes"} else []
-    # Here, so that a wrong name is told before anything is measured.
+    # Composed here, so that a wrong name is reported before anything is measured.
     composed = [of_measured(name, config) for name in measured]
     for experiment in counted:
         compose("train", [f"+exp={experiment}"])
@@ -80,7 +80,7 @@ def main(config: dict[str, Any]) -> None:
 
 
 def experiments(wanted: Any, key: str) -> list[str]:
-    """Names of files of conf/exp: those `wanted`, a list, or all of them."""
+    """Names of files in conf/exp: those in the list `wanted`, or all of them."""
     if wanted == "all":
         return sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
     is_list = isinstance(wanted, list) and bool(wanted) and all(isinstance(name, str) for name in wanted)
@@ -103,7 +103,7 @@ def sizes(names: Sequence[str], config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def evaluations(composed: Mapping[str, Any], config: Mapping[str, Any]) -> list[int]:
-    """The numbers of evaluations to measure an experiment with."""
+    """The NFEs at which an experiment is measured."""
     return config["nfe"] or composed["evaluation"]["nfe"]
 
 
@@ -115,7 +115,7 @@ def of_measured(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
 def measure_and_print(
     experiment: str, composed: Mapping[str, Any], config: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """All figures of an experiment but its size."""
+    """All figures of an experiment except its size."""
     log.info("measuring %s at scale %s", experiment, config["at_scale"])
     with tempfile.TemporaryDirectory() as scratch:
         figures = measure(composed, config, Path(scratch))
@@ -125,8 +125,9 @@ def measure_and_print(
 
 
 def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Path) -> dict[str, Any]:
-    """The wanted figures of one experiment."""
-    import torch  # here, since imports take seconds and slips in the config are told before
+    """The requested figures of one experiment."""
+    # Imported late: it takes seconds, and mistakes in the config are reported first.
+    import torch
 
     from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency

@@ -1,4 +1,4 @@
-"""The frame in which a policy thinks of action chunks: relative to the arms' present joints, and standardised.
+"""The frame in which a policy represents action chunks: relative to the arms' current joints, and standardised.
 
 Shapes: B batch, Tp predicted steps, A action, S state; A equals S, channel by channel.
 """
@@ -18,9 +18,9 @@ MIN_SCALE = 2e-3  # rad, or share of a gripper's opening
 class ChunkFrame(nn.Module):
     """Chunks (B, Tp, A) in physical units to and from what generators learn, in one of two frames.
 
-    "relative": joint targets less the joint angles at the decision; each step of the chunk has its own mean and
-    deviation. Most of an absolute target is known from the state; what is left is where to go, which only the pictures
-    tell. Gripper openings stay absolute.
+    "relative": joint targets minus the joint angles at the decision; each step of the chunk has its own mean and
+    deviation. Most of an absolute target is known from the state; what remains is where to go, which only the pictures
+    show. Gripper openings stay absolute.
     "absolute": targets as they are, one mean and deviation for all steps.
     """
 

@@ -12,14 +12,15 @@ from imfvla.entry import entry_point
 
 @entry_point("collect")
 def main(config: dict[str, Any]) -> None:
-    from imfvla.collection import collect  # after the config is composed: a slip is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla.collection import collect
 
     demos = {key: value for key, value in config.items() if key not in ("task", "observation")}
     report = collect(config["task"], config["observation"], demos)
     found = report.recordings
     print(
         f"{found.directory}: {len(found.files)} demonstrations, {report.num_new} of them new in "
-        f"{report.wall_s:.0f} s; {report.num_failed} failed and were left out."
+        f"{report.wall_s:.0f} s; {report.num_failed} failed and were discarded."
     )
 
 

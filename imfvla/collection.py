@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """Which demonstrations are wanted and where they live."""
+    """Which demonstrations are requested and where they are stored."""
 
     episodes: Annotated[int, within(1, SEED_LIMIT)]
     first_seed: Annotated[int, within(0, SEED_LIMIT - 1)]
@@ -96,7 +96,7 @@ def check_demonstrations(config: Mapping[str, Any]) -> None:
 def ensure_demonstrations(config: Mapping[str, Any]) -> Recordings:
     """Exactly the demonstrations that `config` (train.yaml composed) asks for.
 
-    What is missing is collected first. Raises UserError as `collect` does.
+    Missing ones are collected first. Raises UserError as `collect` does.
     """
     return collect(config["task"], config["observation"], config["demos"], "demos").recordings
 
@@ -108,18 +108,19 @@ def collect(
 
     Each success becomes `episode-<seed>.mcap` in a folder of `demos.directory` named after task, variant, modes and
     image size. Complete files are kept, so that an interrupted collection resumes; the seeds of failed demonstrations
-    are listed in `collection.json`. The seeds that are used depend on the settings alone, not on how the work was
-    shared out. Other files of the folder are left alone and not used. `where` is the key of `demos` in the config.
+    are listed in `collection.json`. The seeds used depend on the settings alone, not on how the work was
+    distributed. Other files in the folder are neither touched nor used. `where` is the key of `demos` in the config.
 
     Raises:
         UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
     """
     options, settings = _read(task, observation, demos, where)
-    _stage_for(settings)  # what cannot be simulated is told before anything is written
+    # Reports what cannot be simulated before anything is written.
+    _stage_for(settings)
     began = time.perf_counter()
     name = folder_name(settings)
     directory = Path(options.directory) / name
-    with locked(directory):  # other jobs of a sweep may want the same demonstrations
+    with locked(directory):  # other jobs of a sweep may need the same demonstrations
         listed = _Log(directory, settings)
         on_file = recorded_seeds(directory) - listed.failed
         _name_others(directory, on_file)
@@ -184,7 +185,7 @@ def _record_missing(
 
 
 def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> list[int]:
-    """The lowest untried seeds, as many as there would be enough successes if all of them succeeded."""
+    """The lowest untried seeds: just enough of them if all succeed."""
     batch: list[int] = []
     num_good = 0
     for seed in range(options.first_seed, SEED_LIMIT):
@@ -203,10 +204,10 @@ def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> lis
 
 
 def record_demonstration(settings: Settings, directory: Path, seed: int) -> tuple[int, bool]:
-    """Plays the expert from `seed` into its file; of a failed demonstration no file is left. Runs in a worker."""
+    """Records the expert from `seed` into its file; a failed demonstration leaves no file. Runs in a worker."""
     env, expert = _stage_for(settings)
     path = recording_path(directory, seed)
-    # Until it has succeeded: a kill must not leave a failure under its name.
+    # A temporary name until it has succeeded: a kill must not leave a failed episode under the final one.
     trial = path.with_suffix(".mcap.trial")
     sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
     sentences = {"paraphrases": env.paraphrases}
@@ -237,7 +238,7 @@ def _stage_for(settings: Settings) -> tuple[Any, Any]:
 class _Log:
     """`collection.json`: what the folder was recorded with and which seeds failed.
 
-    A folder without any recording takes other settings, so that a collection that failed at once blocks nothing.
+    A folder without recordings accepts other settings, so that a collection that failed at once blocks nothing.
     """
 
     def __init__(self, directory: Path, settings: Settings) -> None:
@@ -301,11 +302,11 @@ def recorded_seeds(directory: Path) -> set[int]:
 
 
 def _name_others(directory: Path, seeds: set[int]) -> None:
-    """Says which recordings of the folder are not those of `seeds`."""
+    """Warns of recordings in the folder that do not belong to `seeds`."""
     ours = {recording_path(directory, seed) for seed in seeds}
     if others := sorted(path.name for path in directory.glob("*.mcap") if path not in ours):
         log.warning(
-            f"{directory} holds files that are no demonstrations of its collection and are not used: "
+            f"{directory} holds files that are not demonstrations of this collection and are not used: "
             f"{', '.join(map(repr, others))}."
         )
 
@@ -321,7 +322,7 @@ def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:
     wanted = ("demonstration", settings.task, seed, settings.views, settings.image_size)
     if found != wanted:
         raise UserError(
-            f"{path} must hold kind, task, seed, views and image size {wanted}, found {found}: it came here under "
-            "another's name; move it away."
+            f"{path} must hold kind, task, seed, views and image size {wanted}, found {found}: its file was "
+            "renamed; move it away."
         )
     return True

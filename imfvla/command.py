@@ -1,4 +1,4 @@
-"""What every command has around it, from its first line to its exit code. Loads nothing that takes time."""
+"""What surrounds every command, from its first line to its exit code. Imports nothing slow."""
 
 import io
 import logging
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TextIO
 
-from imfvla.errors import UserError, told
+from imfvla.errors import UserError, as_user_error
 from imfvla.signals import Stopped, StopRequest, stop_at_once, stoppable
 
 EXIT_FAILURE, EXIT_USER_ERROR = 1, 2
@@ -19,8 +19,8 @@ P = ParamSpec("P")
 def begin() -> None:
     """The first call of a command's file, before its other imports, which take seconds.
 
-    A signal ends the process without a traceback. Standard output and standard error show what their encoding lacks
-    as escapes, are open in any case, and drop what is written when nobody reads it any more.
+    A signal ends the process without a traceback. Standard output and standard error escape what their encoding
+    lacks, are always open, and drop what is written once nobody reads it any more.
     """
     stop_at_once()
     logging.raiseExceptions = False  # a line of a log that cannot be written is dropped too
@@ -29,7 +29,7 @@ def begin() -> None:
 
 
 def as_command(function: Callable[P, int | None]) -> Callable[P, int]:
-    """Decorator: the function returns its exit code, None for 0, and so it does after what a user can correct or wants.
+    """Decorator: the function returns its exit code (None for 0), also after a stop or a user's mistake.
 
     2 after a UserError or a system error that the user can correct, whose sentence goes to stderr; 130, 143 or 138
     after Ctrl-C, SIGTERM or SIGUSR1. Other errors are raised.
@@ -42,13 +42,14 @@ def as_command(function: Callable[P, int | None]) -> Callable[P, int]:
             with stoppable() as request:
                 _check_working_directory()
                 code = function(*args, **kwargs) or 0
-                sys.stdout.flush()  # an error of its own at the very end could not be told
+                # Flushed here: the interpreter could not report an error of its own flush at exit.
+                sys.stdout.flush()
         except Stopped as stop:
             request.number = stop.number
         except KeyboardInterrupt:
             request.number = signal.SIGINT
         except Exception as error:
-            known = told(error)
+            known = as_user_error(error)
             if request.number is None and known is None:
                 raise
             if request.number is None:
@@ -64,7 +65,7 @@ def as_command(function: Callable[P, int | None]) -> Callable[P, int]:
 
 
 class _Output(io.FileIO):
-    """File 1 or 2. What cannot be written is dropped, but for the first error of file 1 that is no reader's leaving."""
+    """File 1 or 2. Drops failed writes, but raises the first error of file 1, unless its reader has left."""
 
     _has_failed = False
 
@@ -79,7 +80,7 @@ class _Output(io.FileIO):
 
 
 def _open_standard_streams() -> None:
-    """Files 0, 1 and 2 exist: else the next file that is opened would be one of them, and get messages."""
+    """Makes sure that files 0, 1 and 2 exist: otherwise the next opened file would be one of them and get messages."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -88,7 +89,7 @@ def _open_standard_streams() -> None:
 
 
 def _stream(usual: TextIO | None, descriptor: int) -> TextIO:
-    """`usual`, or one for a file that was closed, as `begin` promises it."""
+    """`usual`, or a replacement where it was closed, with the behaviour that `begin` promises."""
     output = _Output(descriptor, "w", closefd=False)
     is_unbuffered = usual is not None and usual.write_through  # PYTHONUNBUFFERED
     return io.TextIOWrapper(

@@ -1,4 +1,4 @@
-"""What is typed on a command line: written as Hydra's grammar wants it, and refused where nothing would come of it."""
+"""The arguments of a command line: rewritten for Hydra's grammar, and refused where they would be ignored."""
 
 import argparse
 import os
@@ -19,19 +19,19 @@ TEXTS = (
 )  # fmt: skip
 LISTS_OF_TEXTS = ("directories", "runs")
 LISTS_OF_NUMBERS = ("nfe", "evaluation.nfe")
-# Of Hydra's own flags those that would be ignored, or go past what a command does around a job, and the way instead.
+# Hydra's own flags that would be ignored or would bypass what a command does around a job, with the alternative.
 NOT_TAKEN = {
     "config_name": "each command has one config",
     "config_path": "name a folder of more configs with --config-dir",
-    "experimental_rerun": "run the command again",
+    "experimental_rerun": "rerun the command",
 }
-# Of Hydra's own keys those that act in a sweep alone, those that act outside of one, and those that act in neither.
+# Hydra's own keys that act only in a sweep, and those that act only outside of one.
 OF_SWEEPS = ("hydra/launcher", "hydra.launcher", "hydra/sweeper", "hydra.sweeper", "hydra.sweep")
 OF_SINGLE_JOBS = ("hydra.run",)
 
 
 def in_hydras_words(overrides: Sequence[str], is_sweep: bool = False) -> list[str]:
-    """The overrides, with what `TEXTS` and `LISTS_OF_TEXTS` name quoted where Hydra would read something else.
+    """The overrides, with the values of `TEXTS` and `LISTS_OF_TEXTS` quoted where Hydra would misread them.
 
     In a sweep, commas outside of paths that exist give choices, as in any other key; outside of one, `nfe=1,2,3` is a
     list.
@@ -40,18 +40,18 @@ def in_hydras_words(overrides: Sequence[str], is_sweep: bool = False) -> list[st
 
 
 def refuse_ignored(known: argparse.Namespace, is_sweep: bool) -> None:
-    """Raises UserError where a flag or key of Hydra's would be ignored, naming it and what to do instead."""
+    """Raises UserError where a flag or key of Hydra would be ignored, naming it and the alternative."""
     for flag, instead in NOT_TAKEN.items():
         if getattr(known, flag) is not None:
-            raise UserError(f"--{flag.replace('_', '-')} is not taken here: {instead}.")
+            raise UserError(f"--{flag.replace('_', '-')} is not supported: {instead}.")
     modes = {"--run": known.run, "-m": known.multirun, "--cfg": known.cfg, "--info": known.info}
     modes |= {"--shell-completion": known.shell_completion}
     if len(chosen := [flag for flag, value in modes.items() if value]) > 1:
-        raise UserError(f"{' and '.join(chosen)} exclude each other: leave one out.")
+        raise UserError(f"{' and '.join(chosen)} exclude each other: drop one.")
     if known.package and not known.cfg:
-        raise UserError("--package says what --cfg shows: add --cfg job.")
+        raise UserError("--package selects what --cfg shows: add --cfg job.")
     if known.resolve and not (known.cfg or known.help):
-        raise UserError("--resolve says how --cfg shows it: add --cfg job.")
+        raise UserError("--resolve acts only with --cfg: add --cfg job.")
     if known.config_dir is not None and not os.path.isdir(known.config_dir):
         raise UserError(
             f"--config-dir {known.config_dir} is not a directory: name one that holds exp/, task/, ..."
@@ -59,10 +59,10 @@ def refuse_ignored(known: argparse.Namespace, is_sweep: bool) -> None:
     for override in known.overrides:
         key = override.lstrip("+~").partition("=")[0]
         if not is_sweep and key.startswith(OF_SWEEPS):
-            raise UserError(f"{key} acts in a sweep alone: add -m, or leave it out.")
+            raise UserError(f"{key} acts only in a sweep: add -m, or drop it.")
         if is_sweep and key.startswith(OF_SINGLE_JOBS):
             raise UserError(
-                f"{key} acts outside of a sweep alone: with -m it is {key.replace('.run', '.sweep')}."
+                f"{key} acts only outside of a sweep: with -m use {key.replace('.run', '.sweep')}."
             )
 
 
@@ -73,8 +73,8 @@ def multiplies(known: argparse.Namespace) -> bool:
 
 
 def quoted(text: str) -> str:
-    """`text` as Hydra writes a value that is to be taken as it is."""
-    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)  # backslashes count before quotes alone
+    """`text` quoted in Hydra's grammar, so that it is taken literally."""
+    escaped = re.sub(r"(\\*)'", r"\1\1\\'", text)  # backslashes escape only before quotes
     return "'" + re.sub(r"(\\+)$", r"\1\1", escaped) + "'"
 
 
@@ -94,7 +94,7 @@ def _in_hydras_words(argument: str, is_sweep: bool) -> str:
 
 
 def _text(value: str, is_sweep: bool) -> str:
-    """`value` itself where Hydra reads it as this text, or as something that was meant, else quoted."""
+    """`value` itself where Hydra reads it as this text or as another intended value, else quoted."""
     if value.startswith("~/"):
         value = os.path.expanduser(value)  # as shells do at the beginning of a word
     read = _read(value)

@@ -1,4 +1,4 @@
-"""python -m imfvla.compare RUN_A RUN_B [nfe=2]: two runs, start by start: a verdict, a table and a picture."""
+"""python -m imfvla.compare RUN_A RUN_B [nfe=2]: two runs compared per start state: a verdict, a table and a picture."""
 
 from imfvla.command import begin
 
@@ -30,7 +30,8 @@ class CompareOptions:
 
 @entry_point("compare")
 def _compare(config: dict[str, Any]) -> None:
-    from imfvla.figures.style import render  # after the config is checked: a slip is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla.figures.style import render
     from imfvla.figures.two_runs import two_runs
     from imfvla.files import write_together
     from imfvla.reporting.two_runs import compare_runs, table_of, verdict
@@ -43,7 +44,7 @@ def _compare(config: dict[str, Any]) -> None:
         )
     nfe = None if config["nfe"] is None else read_nfe(config["nfe"])
     if nfe is not None and len(nfe) > 2:
-        raise UserError(f"nfe must be one number, or one of each run, found {nfe}.")
+        raise UserError(f"nfe must be one number, or one for each run, found {nfe}.")
     duels = compare_runs(*map(RunDirectory, config["runs"]), nfe)
     table, verdicts = table_of(duels), [verdict(duel) for duel in duels]
     text = "\n\n".join(verdicts)

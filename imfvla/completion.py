@@ -16,19 +16,20 @@ from imfvla.run_directory import (
     training_steps,
 )
 
+# The keys of `evaluation` under the names that a protocol gives them.
 PROTOCOL_KEYS = (
     "first_seed",
     "episodes",
     "noise_seed",
     "noise_scale",
     "device",
-)  # of `evaluation`, as a protocol names them
+)
 
 
 def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
     """Whether this config's run is done there, with every evaluation that the config asks for.
 
-    False where its files cannot be read: running it then says why.
+    False where its files cannot be read: running it then reports why.
     """
     try:
         step = RunDirectory(directory).weights_step(config["evaluation"]["checkpoint"])
@@ -38,7 +39,7 @@ def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
 
 
 def is_reported(config: Mapping[str, Any], directory: Path) -> bool:
-    """The same of a result, which has no weights."""
+    """The same for a shipped result, which has no weights."""
     try:
         steps = training_steps(config, directory)
         return _has_evaluations(config, directory, step_of(steps, config["evaluation"]["checkpoint"]))

@@ -67,7 +67,7 @@ def plain_name(name: str) -> str:
     """`name` itself. Raises UserError where it is a path, which would lead out of the folder of all runs."""
     if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.,=+-]*", str(name)):
         raise UserError(
-            f"name must have letters, digits and _.,=+- alone, found {name!r}: choose another name=..."
+            f"name must consist of letters, digits and _.,=+-, found {name!r}: choose another name=..."
         )
     return str(name)
 
@@ -80,7 +80,7 @@ def register_resolvers() -> None:
 
 
 def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | None = None) -> None:
-    """Raises UserError for `+key=value` unless `key` is a group, of `conf` or of `more`: all keys exist already."""
+    """Raises UserError for `+key=value` unless `key` is a group of `conf` or `more`: all other keys exist already."""
     roots = [CONFIG_DIRECTORY, *([more] if more else [])]
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
@@ -93,7 +93,7 @@ def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | N
 
 
 def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> UserError:
-    """The one sentence that names the thing, what was found and the names that exist."""
+    """The one sentence that names the key or group, what was found and the names that exist."""
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.removesuffix(".yaml").rpartition("/")
         options = sorted(error.options)
@@ -123,7 +123,7 @@ def explain(error: Exception, config_name: str, overrides: Sequence[str]) -> Use
 def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserError:
     if (CONFIG_DIRECTORY / key).is_dir():
         given = next((text for text in overrides if key_of(text) == key), f"{key}=...")
-        return UserError(f"{key} is chosen with a plus sign: write +{given.lstrip('+')} instead of {given}.")
+        return UserError(f"{key} needs a plus sign: write +{given.lstrip('+')} instead of {given}.")
     node: Any = _config_of_groups(config_name, overrides)
     parts = key.replace("/", ".").split(".")
     parents: list[str] = []
@@ -134,14 +134,14 @@ def _unknown_key(key: str, config_name: str, overrides: Sequence[str]) -> UserEr
         parents.append(part)
     names = sorted(str(name) for name in node) if isinstance(node, dict) else []
     where = f"in {'.'.join(parents)}" if parents else "at the top"
-    slip = parts[len(parents)]
-    if slip in names and len(parts) == len(parents) + 1:
-        return UserError(f"{key} is known already: write {key}=... without a plus sign.")
-    return UserError(f"Unknown key {key}{suggestion(slip, names)}: {where} are {', '.join(names)}.")
+    unknown = parts[len(parents)]
+    if unknown in names and len(parts) == len(parents) + 1:
+        return UserError(f"{key} exists already: write {key}=... without a plus sign.")
+    return UserError(f"Unknown key {key}{suggestion(unknown, names)}: {where} are {', '.join(names)}.")
 
 
 def _config_of_groups(config_name: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """The config under those overrides alone that choose groups: its keys are the ones that exist."""
+    """The config under only those overrides that choose groups: its keys are the ones that exist."""
     choices = [text for text in overrides if (CONFIG_DIRECTORY / key_of(text)).is_dir()]
     for trial in (choices, []):
         try:
@@ -158,7 +158,7 @@ def config_directory() -> Path:
     """Where the YAML files are. Raises UserError where there are none."""
     if not CONFIG_DIRECTORY.is_dir():
         raise UserError(
-            f"{CONFIG_DIRECTORY} is not there: configs are read from the clone, installed by pip install -e ."
+            f"{CONFIG_DIRECTORY} does not exist: configs are read from the clone, installed by pip install -e ."
         )
     return CONFIG_DIRECTORY
 

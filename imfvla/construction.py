@@ -1,4 +1,4 @@
-"""Builds what a config's `_target_` names, from a short list of places: a stranger's config must not run code."""
+"""Builds what a config's `_target_` names, from a short list of packages: a stranger's config must not run code."""
 
 import importlib
 import inspect
@@ -19,7 +19,7 @@ OPTIMISERS = "torch.optim"
 # `_args_` and `_recursive_` would change how a part is built from what its constructor says.
 SPECIAL_KEYS = ("_target_", "_partial_")
 MAX_DEPTH = 32
-MAX_COUNT = 10**6  # of layers, channels and whatever else is counted: more would not be built in a lifetime
+MAX_COUNT = 10**6  # of layers, channels and other counts: more could not be built in a lifetime
 MAX_REASON = 200  # characters of what torch says
 CHECKED = (bool, int, float, str, types.NoneType)
 
@@ -27,9 +27,9 @@ CHECKED = (bool, int, float, str, types.NoneType)
 def construct(part: Mapping[str, Any], key: str) -> Any:
     """The object that `part`, a resolved config under `key`, describes; nested parts are built first.
 
-    Raises UserError, before anything is built, where a `_target_` is no class of `PACKAGES` and no optimiser of torch,
-    where a value is not as the types of the constructor and their `Limit` say, or where a text is an interpolation,
-    which would read the environment. What a constructor raises passes wrapped by Hydra.
+    Raises UserError, before anything is built, where a `_target_` is neither a class of `PACKAGES` nor an optimiser of
+    torch, where a value violates the types of the constructor or their `Limit`, or where a text is an interpolation,
+    which would read the environment. What a constructor raises arrives wrapped by Hydra.
     """
     if not isinstance(part, Mapping) or "_target_" not in part:
         raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
@@ -45,22 +45,21 @@ def refuse_foreign_target(target: Any, key: str) -> None:
     if not (isinstance(target, str) and _is_ours(target)):
         raise UserError(
             f"{key} must name a class defined in {', '.join(PACKAGES)}, or an optimiser of {OPTIMISERS}, "
-            f"found {target!r}: a config from somewhere else must not choose what is run."
+            f"found {target!r}: a config from elsewhere must not choose what is run."
         )
 
 
 def reason_of(error: BaseException) -> str:
-    """What an error says, without the stack of C++ that torch appends."""
+    """The message of an error, without the C++ stack that torch appends."""
     return (str(error).splitlines() or [type(error).__name__])[0][:MAX_REASON]
 
 
 def _check_arguments(part: Mapping[str, Any], key: str) -> None:
-    """Raises UserError where an argument of a class of ours is not as the types of its constructor say."""
+    """Raises UserError where an argument of one of our classes violates the types of its constructor."""
     module_name, _, name = part["_target_"].rpartition(".")
     hints: dict[str, Any] = {}
-    for cls in reversed(
-        getattr(importlib.import_module(module_name), name).__mro__[:-1]
-    ):  # base classes first
+    # Base classes first.
+    for cls in reversed(getattr(importlib.import_module(module_name), name).__mro__[:-1]):
         hints |= get_type_hints(cls.__init__, include_extras=True)
     for argument, value in part.items():
         if _is_checked(hints.get(argument)):
@@ -103,7 +102,7 @@ def _refuse_foreign(value: Any, key: str, depth: int) -> None:
                 refuse_foreign_target(item, where)
             elif re.fullmatch(r"_\w+_", str(name)) and name not in SPECIAL_KEYS:
                 raise UserError(
-                    f"{where} is not allowed: of Hydra's own keys there are {', '.join(SPECIAL_KEYS)}."
+                    f"{where} is not allowed: Hydra's own keys here are {', '.join(SPECIAL_KEYS)}."
                 )
             else:
                 _refuse_foreign(item, where, depth + 1)

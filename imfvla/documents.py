@@ -30,8 +30,8 @@ def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
         value = parse_json(read_text(path, MAX_JSON_BYTES))
         if mapping and not isinstance(value, dict):
             raise ValueError(f"wanted a mapping, found {type(value).__name__}")
-    except PermissionError as error:  # what may be whole is not to be deleted
-        raise UserError(f"{path} cannot be read: {error.strerror}; check its rights.") from error
+    except PermissionError as error:  # a file that may be intact must not be deleted
+        raise UserError(f"{path} cannot be read: {error.strerror}; check its permissions.") from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as JSON: {error}; {remedy}.") from error
     return value
@@ -46,12 +46,12 @@ def read_yaml(path: Path, loader: type[yaml.SafeLoader] = ChosenLoader) -> Any:
         return yaml.load(text, Loader=loader)  # a SafeLoader
     except FileNotFoundError:
         raise
-    except Exception as error:  # a date that does not exist or a deep nesting surface as anything
+    except Exception as error:  # an impossible date or deep nesting can raise anything
         raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
 
 
 def _bracket_depth(text: str) -> int:
-    """The time to read nested brackets grows with the square of their depth, so it is found out before."""
+    """Reading nested brackets takes time that grows with the square of their depth, so the depth is checked first."""
     changes = (1 if match.group() in "[{" else -1 for match in re.finditer(r"[\[\]{}]", text))
     return max(accumulate(changes), default=0)
 

@@ -1,4 +1,4 @@
-"""Temporal ensembling: the action of a step as the mean of what all chunks that cover it say (arXiv 2304.13705).
+"""Temporal ensembling: the action of a step is the mean over all chunks that cover it (arXiv 2304.13705).
 
 Shapes: Tp predicted steps, A action.
 """

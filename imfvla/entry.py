@@ -1,4 +1,4 @@
-"""What `python -m imfvla.<name>` has around it beside `imfvla.command`: Hydra, sweeps, the failures of their jobs."""
+"""What surrounds `python -m imfvla.<name>` besides `imfvla.command`: Hydra, sweeps, the failures of their jobs."""
 
 import argparse
 import os
@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from imfvla import composition
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
 from imfvla.command_line import in_hydras_words, multiplies, refuse_ignored
-from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, told
+from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
 from imfvla.jobs import Failure, Job
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
@@ -30,10 +30,10 @@ def entry_point(
 
     The function receives the resolved config as plain dicts and lists. The command `main(argv=None)` returns
     on success and otherwise exits: 2 after a UserError, whose text alone goes to stderr; 130 after Ctrl-C, 143
-    after SIGTERM, 138 after SIGUSR1 (then the same command goes on); 1 with a traceback after anything else. In
-    a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run but those that
-    `is_finished(config, directory)` tells from their files; the failures are listed at the end. Where there is a
-    `usage`, a command without any override does nothing but tell it, and exits with 2. The config
+    after SIGTERM, 138 after SIGUSR1 (rerun the same command to resume); 1 with a traceback after anything else. In
+    a sweep (`-m`, or `+sweep=NAME` for one of conf/sweep) all jobs run except those that
+    `is_finished(config, directory)` recognises by their files; the failures are listed at the end. With a
+    `usage`, a command without any override only prints it and exits with 2. The config
     overrides `hydra/output` and `hydra/job_logging`, both with `run` (deterministic run directory, see
     `output_directory`, and its train.log) or both with `plain` (nothing written).
     """
@@ -52,7 +52,7 @@ def entry_point(
 
 
 def output_directory() -> Path:
-    """Inside an entry point: the directory that Hydra gave this job (`hydra.run.dir`)."""
+    """Inside an entry point: this job's directory from Hydra (`hydra.run.dir`)."""
     return Path(HydraConfig.get().runtime.output_dir)
 
 
@@ -68,7 +68,7 @@ def _run(
     known.overrides = in_hydras_words(known.overrides, is_sweep)
     if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
         known.overrides.append("hydra/job_logging=disabled")
-    arguments = [*flags, *known.overrides]  # Hydra takes no override behind a flag that is behind one
+    arguments = [*flags, *known.overrides]  # Hydra rejects overrides on both sides of a flag
     try:
         with _hydra_raises(arguments):
             refuse_ignored(known, is_sweep)
@@ -84,7 +84,7 @@ def _run(
     except (HydraException, OmegaConfBaseException) as error:
         raise composition.explain(error, job.config_name, known.overrides) from error
     except (OSError, ValueError) as error:  # ours, and of what Hydra itself writes: directories, train.log
-        if (known_error := told(error, REMEDIES | WHERE_MISSING)) is None:
+        if (known_error := as_user_error(error, REMEDIES | WHERE_MISSING)) is None:
             raise
         raise known_error from error
     return _report(failures)
@@ -105,7 +105,7 @@ def _shows_only(known: argparse.Namespace) -> bool:
 
 @contextmanager
 def _hydra_raises(arguments: Sequence[str]) -> Iterator[None]:
-    """Hydra takes these arguments and raises its errors instead of printing them in its own way."""
+    """Passes these arguments to Hydra, and makes it raise its errors instead of printing them."""
     full_error, sys_argv = os.environ.get("HYDRA_FULL_ERROR"), sys.argv
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = [sys.argv[0], *arguments]

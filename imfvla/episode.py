@@ -1,4 +1,4 @@
-"""What an episode is made of, for simulator, recorder, evaluator and report alike. Needs numpy only."""
+"""What an episode consists of, for simulator, recorder, evaluator and report. Needs numpy only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,18 +20,18 @@ class EpisodeInfo:
 
     task: str  # "socket" | "transfer" | "combined"
     kind: str  # "demonstration" | "rollout"
-    seed: int  # handed to reset; draws the start state
+    seed: int  # passed to reset; draws the start state
     start_digest: str  # hex digest of the start state
     instruction: str
     views: tuple[str, ...]
     image_size: tuple[int, int]  # (H, W) [px]
-    config: Mapping[str, Any]  # attached to the recording whole
+    config: Mapping[str, Any]  # attached to the recording in full
     metadata: Mapping[str, Any] = field(default_factory=dict)  # expert style, policy name, nfe, ...
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What an actor answers at one control step."""
+    """An actor's answer at one control step."""
 
     action: np.ndarray  # float32 (A,)  what a policy should learn here, physical units
     executed: np.ndarray  # float32 (A,)  what is applied: `action`, plus exploration noise in demonstrations
@@ -66,7 +66,7 @@ class EpisodeResult:
     failure: str | None  # label of an abnormal end ("non-finite action", ...), None for a normal one
     inference_ms: tuple[float, ...]  # one per replanning
     wall_s: float
-    goal: str | None = None  # the task that the episode was about, where its scene serves several
+    goal: str | None = None  # the task of the episode, where its scene serves several
 
 
 class Actor(Protocol):

@@ -1,4 +1,4 @@
-"""The one error type that users see, and the system's errors in its words."""
+"""The one error type that users see, and the conversion of system errors into it."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ _SPACE = "free some space there"
 _PERMISSION = "check who may read and write there, or choose another directory"
 _IN_THE_WAY = "remove what has that name, or choose another directory"
 _DEVICE = "check that disk or network"
-# What the user can do about an error of the system. A missing file is none: only its reader knows what that means.
+# What the user can do about a system error. A missing file is not listed: only its reader knows what it means.
 REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
@@ -28,23 +28,23 @@ REMEDIES = {
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.EIO: _DEVICE,
     errno.ESTALE: _DEVICE,
-    errno.EMFILE: "no file handle is left, raise the limit with ulimit -n 4096",
-    errno.ENFILE: "no file handle is left, stop other programs",
+    errno.EMFILE: "no file handle is left; raise the limit with ulimit -n 4096",
+    errno.ENFILE: "no file handle is left; stop other programs",
 }
-WHERE_MISSING = {errno.ENOENT: "check that the directories above it are there"}
+WHERE_MISSING = {errno.ENOENT: "check that its parent directories exist"}
 
 
-def told(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
-    """A UserError itself, or one for a system error or what was raised because of it; None for other errors."""
+def as_user_error(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
+    """A UserError itself, or one for a system error or for an error that it caused; None for other errors."""
     if isinstance(error, UserError):
         return error
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and isinstance(cause.__context__, UserError) and not cause.filename:
-            return cause.__context__  # that closing the file has met with again, and names no file for
+            return cause.__context__  # closing the file met the same error again, without the file's name
         if isinstance(cause, OSError) and cause.errno in remedies:
             file = f" at {os.fsdecode(cause.filename)}" if isinstance(cause.filename, str | bytes) else ""
-            return UserError(f"{cause.strerror}{file}: {remedies[cause.errno]}; run the same command again.")
+            return UserError(f"{cause.strerror}{file}: {remedies[cause.errno]}; rerun the same command.")
         if isinstance(cause, MemoryError):
             return UserError(
                 f"Out of memory: {cause or 'no details'}; choose fewer workers=... or a smaller batch."

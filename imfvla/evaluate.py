@@ -16,7 +16,8 @@ from imfvla.run_directory import RunDirectory
 
 @entry_point("evaluate")
 def main(config: dict[str, Any]) -> None:
-    from imfvla.evaluation import evaluate  # after the config is checked: a slip is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla.evaluation import evaluate
     from imfvla.reporting.table_row import print_row
 
     require(config["run"] is None or isinstance(config["run"], str), "run", "a directory", config["run"])
@@ -33,7 +34,7 @@ def main(config: dict[str, Any]) -> None:
 
 
 def read_nfe(value: Any) -> list[int]:
-    """Numbers of flow evaluations from a number, a list, or a text such as "1,2,3". Raises UserError."""
+    """Numbers of flow steps from a number, a list, or a text such as "1,2,3". Raises UserError."""
     items = value.split(",") if isinstance(value, str) else value if isinstance(value, list) else [value]
     try:
         numbers = [item if is_whole(item) else int(str(item)) for item in items]

@@ -28,7 +28,7 @@ def evaluate(
 
     For each, writes `rollouts/<name>/` with `episodes.jsonl` (ordered by seed, equal for equal protocols
     but for the key "timing"), `summary.json`, and, with `recordings`, MCAP and mp4 of the best, the
-    median and the worst episode. An interrupted evaluation goes on where it stopped; a finished one is
+    median and the worst episode. An interrupted evaluation resumes where it stopped; a finished one is
     not repeated, unless `overwrite`. `build` makes environment and policy, in each worker once.
 
     Returns:
@@ -107,7 +107,7 @@ def require_device(device: str, key: str) -> None:
 
 
 def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: Here | Pool) -> list[Row]:
-    """The rows of all seeds, ordered, those that were missing freshly made."""
+    """The rows of all seeds, ordered; missing ones are played."""
     rows = {row["seed"]: row for row in rollouts.rows}
     missing = [seed for seed in protocol.seeds if seed not in rows]
     with Progress(f"{protocol.task}, nfe {protocol.nfe}", protocol.episodes, done=len(rows)) as bar:
@@ -119,7 +119,7 @@ def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: H
 
 
 def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: Here | Pool) -> dict[str, Any]:
-    """Plays the best, the median and the worst episode again into files; says which they are."""
+    """Replays the best, the median and the worst episode into files; returns which they are."""
     chosen = best_median_worst(rows)
     paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}
     calls = [(job, row, paths[label]) for label, row in chosen.items()]

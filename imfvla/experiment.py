@@ -1,4 +1,4 @@
-"""An experiment from nothing to its row of the table: collect, train, evaluate. Run again, it goes on."""
+"""An experiment from nothing to its row of the table: collect, train, evaluate. A rerun resumes it."""
 
 import logging
 import os
@@ -32,10 +32,10 @@ log = logging.getLogger(__name__)
 
 
 def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
-    """Does what is not done yet of the experiment in `run` and prints its row.
+    """Does the remaining work of the experiment in `run` and prints its row.
 
     `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
-    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be had.
+    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
     """
     options = read_options(config)
     training, optim, evaluation = options.training, options.optim, options.evaluation
@@ -65,7 +65,7 @@ def _run_stages(
     evaluation: EvaluationOptions,
     processes: Alone,
 ) -> None:
-    """All but the shares of the other processes."""
+    """All stages, except the other processes' shares of training."""
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         try:
@@ -80,7 +80,7 @@ def _run_stages(
             if run.status().get("state") != DONE:
                 run.write_status(DONE)
         except KeyboardInterrupt:
-            run.write_status(FAILED, error="interrupted; the same command goes on")
+            run.write_status(FAILED, error="interrupted; rerun the same command to resume")
             raise
         except Exception as error:
             with suppress(UserError):  # a full disk must not hide the error
@@ -102,7 +102,7 @@ def _train(
         run.write_status(RUNNING, phase="training", pid=os.getpid())
         processes.wait()
     else:
-        processes.wait()  # for demonstrations and frame store, which are there then
+        processes.wait()  # for demonstrations and frame store, which exist by then
         windows = prepare_windows(config, ensure_demonstrations(config))
     seed = config["seed"]
     initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)

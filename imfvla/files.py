@@ -26,9 +26,8 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     with clear_write_errors(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.unlink(
-                missing_ok=True
-            )  # of a killed process, or a link that somebody left to elsewhere
+            # A leftover of a killed process, or a link to somewhere else.
+            temporary.unlink(missing_ok=True)
             write(temporary)
             sync(temporary)
             os.replace(temporary, path)
@@ -45,7 +44,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
-    """All files or none: each is written beside its place first, and takes it once all of them are written.
+    """All files or none: each is written beside its place, and they move there once all are written.
 
     Raises UserError on a write error; then the old files are still there.
     """
@@ -81,7 +80,7 @@ def write_json(path: Path, value: Any) -> None:
 def locked(path: Path) -> Iterator[None]:
     """Waits until no other process holds the lock of `path`, a hidden file beside it, and holds it.
 
-    Where none can be written nothing else can be either, and nothing is waited for.
+    Where no lock file can be written, nothing else can be either, and there is nothing to wait for.
     """
     with ExitStack() as held:
         with suppress(OSError):
@@ -92,9 +91,9 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def take_lock(descriptor: int, path: Path, *, wait: bool = False) -> bool:
-    """Whether this process has the lock of an open file from now on: not where another one has it, unless it waits.
+    """Takes the lock of an open file; False where another process holds it, unless it waits.
 
-    Some file systems, of networks above all, have no locks. Then `path` is named in a warning and work starts without.
+    Some file systems, mainly network ones, have no locks. Then a warning names `path` and work starts without one.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -127,11 +126,11 @@ def clear_write_errors(path: Path) -> Any:
 
 
 def write_remedy(error: OSError) -> str:
-    """What helps against a failed write."""
+    """What the user can do about a failed write."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "free some space there and run the same command again; what was written before is intact"
+        return "free some space there and rerun the same command; what was written before is intact"
     if error.errno in (errno.EMFILE, errno.ENFILE):
-        return "no file handle is left: raise the limit (ulimit -n 4096) and run the same command again"
+        return "no file handle is left: raise the limit (ulimit -n 4096) and rerun the same command"
     if error.errno == errno.EFBIG:
         return "raise the limit on the size of files (ulimit -f), or choose another directory"
-    return "check that the directory is there and may be written to, then run the same command again"
+    return "check that the directory exists and is writable, then rerun the same command"

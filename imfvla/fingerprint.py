@@ -1,4 +1,4 @@
-"""What a result depends on beside its config: machine, packages and code. Recorded with every run."""
+"""What a result depends on besides its config: machine, packages and code. Recorded with every run."""
 
 import os
 import platform
@@ -79,7 +79,7 @@ def packages() -> dict[str, str]:
 
 
 def physical_cores() -> int:
-    """Cores that this process may use, hyper-threads not counted twice."""
+    """Physical cores that this process may use; hyper-threads are not counted twice."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(psutil.cpu_count(logical=False) or allowed, allowed))
 

@@ -1,4 +1,4 @@
-"""python -m imfvla.gallery task=socket: a contact sheet of every view, for both ways of the hidden choice."""
+"""python -m imfvla.gallery task=socket: a contact sheet of every view, for both outcomes of the hidden choice."""
 
 from imfvla.command import begin
 
@@ -22,7 +22,7 @@ MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
 
 @dataclass(frozen=True, slots=True)
 class GalleryOptions:
-    """conf/gallery.yaml, the task apart."""
+    """conf/gallery.yaml without the task."""
 
     seed: Annotated[int, within(0, 2**31)]
     size: Annotated[int, within(16, 960)]
@@ -41,7 +41,8 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
 
     Columns are the views, rows the moments of the episode: start, a quarter, middle and end.
     """
-    from imfvla import tasks  # here, with what draws: a mistake in the config is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla import tasks
     from imfvla.figures.contact_sheet import contact_sheet, png
 
     env = tasks.load(task["name"], variant=task["variant"])
@@ -74,7 +75,7 @@ def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[
 
 
 def _play(env: Any, expert: Any, seed: int, size: int, every: int = 10) -> list[tuple[int, list[np.ndarray]]]:
-    """Steps done and pictures of all views every few steps of an episode, its first and last state among them."""
+    """Steps done and pictures of all views every few steps of an episode, including its first and last state."""
     env.reset(seed)
     expert.reset(env, seed)
     frames = []

@@ -1,4 +1,4 @@
-"""Chooses how MuJoCo draws without a screen; must run before mujoco is imported."""
+"""Chooses how MuJoCo renders without a screen; must run before mujoco is imported."""
 
 import json
 import os
@@ -22,7 +22,7 @@ PACKAGES = {
 
 
 class WrongSetting(UserError):
-    """An environment variable asks for what is not there; no package helps."""
+    """An environment variable asks for something that does not exist; no package helps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +43,10 @@ def select_gl_backend() -> str:
     """Sets MUJOCO_GL, PYOPENGL_PLATFORM and LP_NUM_THREADS for this process and returns the backend's name.
 
     A MUJOCO_GL that is already set is honoured; otherwise EGL is taken where it draws, else OSMesa.
-    Software rendering gains nothing from threads at these image sizes, so llvmpipe gets none.
+    Software rendering gains nothing from threads at these image sizes, so llvmpipe uses none.
 
     Raises:
-        WrongSetting: MUJOCO_GL or MUJOCO_EGL_DEVICE_ID has a value that nothing answers to.
+        WrongSetting: MUJOCO_GL or MUJOCO_EGL_DEVICE_ID names no backend or device.
         UserError: no backend draws.
     """
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()

@@ -1,7 +1,7 @@
 """Whether a GL backend can draw: `python gl_probe.py egl` prints {"devices": ..., "problem": null or a text} as JSON.
 
 A program of its own that knows nothing of imfvla: PyOpenGL binds a process to one backend, and a driver that hangs or
-crashes must not take the caller with it. It goes the way of dm_control and PyOpenGL: the same libraries, the first
+crashes must not take the caller with it. It does what dm_control and PyOpenGL do: the same libraries, the first
 device that initialises, the same framebuffer.
 """
 
@@ -47,7 +47,7 @@ def function(library: ctypes.CDLL, name: str, result: type | None, *arguments: t
 
 
 def check_egl() -> int:
-    """Makes a context current on a device and asks what draws; returns the number of devices."""
+    """Makes a context current on a device and asks for the renderer; returns the number of devices."""
     egl = load("EGL")
     find = function(egl, "eglGetProcAddress", c_void_p, ctypes.c_char_p)
     query_address, display_address = find(b"eglQueryDevicesEXT"), find(b"eglGetPlatformDisplayEXT")
@@ -92,7 +92,7 @@ def _draw_with_egl(egl: ctypes.CDLL, displays: Iterable[int | None]) -> None:
 
 
 def check_osmesa() -> int:
-    """Makes a context current on a picture of its own and asks what draws; there are no devices to count."""
+    """Makes a context current on an off-screen buffer and asks for the renderer; there are no devices to count."""
     osmesa = load("OSMesa")
     create = function(osmesa, "OSMesaCreateContextExt", c_void_p, c_uint, c_int, c_int, c_int, c_void_p)
     make_current = function(osmesa, "OSMesaMakeCurrent", c_uint, c_void_p, c_void_p, c_uint, c_int, c_int)

@@ -58,5 +58,5 @@ class Horizon:
         return step % self.exec == 0
 
     def is_observed(self, step: int) -> bool:
-        """Whether the observation of `step` enters a decision: the steps whose cameras must be looked at."""
+        """Whether the observation of `step` enters a decision: the steps whose cameras must be rendered."""
         return (-step) % self.exec < self.obs

@@ -12,12 +12,12 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
-from imfvla.errors import UserError, told
+from imfvla.errors import UserError, as_user_error
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """What is told of a job that failed: one sentence for a user's mistake, else a traceback."""
+    """The report of a job that failed: one sentence for a user's mistake, else a traceback."""
 
     overrides: str
     text: str
@@ -27,7 +27,7 @@ class Failure:
     def of(cls, error: Exception, config_name: str, overrides: str) -> "Failure":
         if isinstance(error, HydraException | OmegaConfBaseException):
             error = composition.explain(error, config_name, overrides.split())
-        known = told(error)
+        known = as_user_error(error)
         if known is not None:
             return cls(overrides, str(known), True)
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)
@@ -36,7 +36,7 @@ class Failure:
 class Job:
     """Hydra's task function around `function(config)`: plain config in, None or a Failure out.
 
-    Launchers send it to other processes by pickle; there it makes the configs' resolvers known again.
+    Launchers send it to other processes by pickle; there it registers the configs' resolvers again.
     """
 
     def __init__(self, function: Callable[[dict[str, Any]], None], config_name: str) -> None:
@@ -50,19 +50,19 @@ class Job:
         try:
             self._refuse_hydras_own_ways(HydraConfig.get())
             self.function(composition.to_plain(config))
-        except Exception as error:  # told at the end, so that the other jobs of a sweep run
+        except Exception as error:  # reported at the end, so that the other jobs of a sweep run
             self.failure = Failure.of(error, self.config_name, overrides)
         return self.failure
 
     def _refuse_hydras_own_ways(self, hydra: DictConfig) -> None:
-        """Raises UserError where a config file changes how Hydra runs jobs to what is not supported here."""
+        """Raises UserError where a config file makes Hydra run jobs in a way that is not supported here."""
         if hydra.mode == RunMode.MULTIRUN and not self.is_of_sweep:
             raise UserError(
                 "hydra.mode is MULTIRUN in a config file: remove it there and add -m to the command."
             )
         if hydra.job.chdir:
             raise UserError(
-                "hydra.job.chdir must be false, found true: paths are relative to where the command is started."
+                "hydra.job.chdir must be false, found true: paths are relative to where the command starts."
             )
 
     def __setstate__(self, state: dict[str, Any]) -> None:

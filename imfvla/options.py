@@ -15,7 +15,7 @@ _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number"
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What a value must be beside its type, in the type of its field: `steps: Annotated[int, at_least(1)]`."""
+    """What a value must be besides its type, as part of the type of its field: `steps: Annotated[int, at_least(1)]`."""
 
     wanted: str
     holds: Callable[[Any], bool]
@@ -81,13 +81,11 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
 
 def part_of(config: Mapping[str, Any], key: str) -> Any:
-    """What a config has under a dotted key. Raises UserError where it was deleted or what holds it is no mapping."""
+    """The value of a config under a dotted key. Raises UserError where it was deleted or its parent is no mapping."""
     found: Any = config
     for number, name in enumerate(parts := key.split(".")):
         if not isinstance(found, Mapping) or name not in found:
-            raise UserError(
-                f"Missing key {'.'.join(parts[: number + 1])}: leave it as the config files have it."
-            )
+            raise UserError(f"Missing key {'.'.join(parts[: number + 1])}: keep it as in the config files.")
         found = found[name]
     return found
 

@@ -13,13 +13,13 @@ from rich.text import Text
 
 log = logging.getLogger(__name__)
 
-LINE_EVERY_S = 15.0  # seconds between lines where nobody watches a bar
+LINE_EVERY_S = 15.0  # seconds between lines where there is no terminal
 
 
 class Progress:
     """Counts `total` items of work: `with Progress("socket", 100) as bar: bar.advance("success 9 of 10")`.
 
-    Inside of another one, as a job inside of a sweep, it is a line below that one's on the terminal.
+    Inside another one, as a job inside a sweep, it is a line below that one's on the terminal.
     """
 
     _display: ClassVar[rich_progress.Progress | None] = None  # of the outermost bar that is entered
@@ -54,7 +54,7 @@ class Progress:
         return self
 
     def advance(self, note: str = "") -> None:
-        """One item is done; `note` is what to show beside the count."""
+        """One item is done; `note` is shown beside the count."""
         self._done += 1
         now = time.monotonic()
         elapsed = now - self._began
@@ -82,7 +82,7 @@ class Progress:
 
 
 class _TimeLeft(rich_progress.ProgressColumn):
-    """Counts down to the end that the items so far foretell; rich's own wants many of them in half a minute."""
+    """The time left as the items so far predict it; rich's own estimate needs many items within half a minute."""
 
     def render(self, task: rich_progress.Task) -> Text:
         end = task.fields["end"]

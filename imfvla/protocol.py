@@ -1,4 +1,4 @@
-"""What is asked of an evaluation, and what its rows depend on beside the code. Needs neither torch nor mujoco."""
+"""The options of an evaluation, and what its rows depend on besides the code. Needs neither torch nor mujoco."""
 
 import re
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
 LAST = "last"  # of the weights that are kept
-MAX_SEED = 2**32 - 1  # numpy's generators and MuJoCo's start states take no higher one
+MAX_SEED = 2**32 - 1  # the highest that numpy's generators and MuJoCo's start states accept
 MAX_EPISODES = 1_000_000
 MAX_WORKERS = 1024
 MAX_TIMEOUT_S = 7 * 24 * 3600
@@ -29,15 +29,15 @@ CHECKPOINT = Limit(
 
 @dataclass(frozen=True, slots=True)
 class EvaluationOptions:
-    """What a user chooses of an evaluation: conf/evaluate.yaml, or the `evaluation` of an experiment.
+    """What a user chooses for an evaluation: conf/evaluate.yaml, or the `evaluation` of an experiment.
 
     Attributes:
       checkpoint: the training step of the weights, a share of the training such as "1/3", or "last".
-      noise_seed: of the noise streams; equal for policies that are to be compared.
-      noise_scale: of the noise that a chunk starts from; below 1 samples are nearer to each other.
+      noise_seed: of the noise streams; use the same for policies to be compared.
+      noise_scale: of the noise that a chunk starts from; below 1 samples are closer to each other.
       device: where the policy computes.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
-      episode_timeout_s: an episode that takes a worker longer is played again by a fresh one; None: no limit.
+      episode_timeout_s: an episode that takes longer is replayed in a fresh worker; None: no limit.
       max_steps: control steps of an episode, None for all.
       recordings: whether the best, the median and the worst episode are recorded.
       overwrite: whether a finished evaluation is repeated.
@@ -65,7 +65,7 @@ class EvaluationOptions:
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Equal protocols give equal rows but for times."""
+    """Equal protocols give equal rows except for times."""
 
     task: str
     variant: str

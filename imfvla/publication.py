@@ -1,4 +1,4 @@
-"""Everything that run directories have to say, as files: tables, figures and a page. Needs neither torch nor mujoco."""
+"""The results of run directories as files: tables, figures and a page. Needs neither torch nor mujoco."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -53,17 +53,17 @@ def publish(
     *,
     media: bool = False,
 ) -> Publication:
-    """What stands in the run directories, as `output` is to hold it; writes nothing.
+    """The results in the run directories, as files for `output`; writes nothing.
 
     Args:
-      directories: hold run directories; for a row, a later one counts before an earlier one.
-      output: directory of the files, from where the page's links lead to the runs.
+      directories: hold run directories; for each row, a later run takes precedence over an earlier one.
+      output: directory of the files; the page's links to runs are relative to it.
       mapping: rows to runs.
       method: a composed training config, for the figures of the method.
-      media: whether videos, recordings and other files of the runs are copied beside the page, which then can be moved.
+      media: whether videos, recordings and other files of the runs are copied beside the page, so that it can be moved.
 
     Raises:
-      UserError: runs are damaged, contradict each other or mix protocols; or no row of theirs is in any table.
+      UserError: runs are damaged, contradict each other or mix protocols; or none of their rows is in any table.
     """
     sources = Sources(directories)
     answers = [sources.answer(row, mapping) for row in mapping.rows]

@@ -1,4 +1,4 @@
-"""What would end an experiment late, found before its first stage: options out of range, a policy that cannot learn."""
+"""Finds before the first stage what would fail later: options out of range, a policy that cannot learn."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from imfvla.views import ViewOptions
 
 @dataclass(frozen=True, slots=True)
 class Scalars:
-    """The keys of train.yaml that are in no group."""
+    """The keys of train.yaml outside of groups."""
 
     name: str
     seed: Annotated[int, within(0, MAX_SEED)]
@@ -45,7 +45,7 @@ class ExperimentOptions:
 
 
 def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
-    """The options of all stages but the policy's and the demonstrations'. Raises UserError on the first wrong one."""
+    """The options of all stages except those of policy and demonstrations. Raises UserError on the first wrong one."""
     build(Scalars, {name: part_of(config, name) for name in Scalars.__slots__}, "")
     build(Horizon, part_of(config, "horizon"), "horizon")
     build(Augmentation, part_of(config, "augmentation"), "augmentation")
@@ -74,7 +74,7 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
 def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
     """The configured policy, after a loss and a chunk on black pictures.
 
-    Raises UserError where it cannot be built, cannot compute them, or cannot do with one of the numbers of evaluations.
+    Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
     """
     try:
         policy = build_unfitted(config).eval()
@@ -87,7 +87,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
             chunk = policy.predict(observation, noise, min(nfe))
     except UserError:
         raise
-    except Exception as error:  # whatever comes of arguments that a constructor took and that are no use
+    except Exception as error:  # unusable arguments that a constructor accepted can raise anything
         raise UserError(
             "the configured policy cannot compute a loss and a chunk: correct encoder, core or generator; torch says "
             f"{reason_of(error)!r}."
@@ -98,7 +98,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
 
 
 def build_unfitted(config: Mapping[str, Any]) -> Policy:
-    """The policy of a composed config with normalisers that change nothing: it computes, though nothing of use."""
+    """The policy of a composed config with normalisers that change nothing: it runs, but its outputs mean nothing."""
     policy = build_policy(config)
     states = torch.ones(config["state_dim"])
     policy.encoder.fit(-states, states)

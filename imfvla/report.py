@@ -38,7 +38,8 @@ def main(config: dict[str, Any]) -> None:
 
         print_row(RunDirectory(config["run"]))
         return
-    from imfvla.publication import publish  # after the config is checked: a slip is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla.publication import publish
     from imfvla.reporting.mapping import PATH, read_mapping
 
     mapping = read_mapping(Path(options.mapping) if options.mapping else PATH)

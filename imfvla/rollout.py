@@ -37,7 +37,7 @@ def run_episode(
 
     An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row
     keeps the reward collected so far, carries the label and counts as no success. Any other exception
-    aborts the sinks and is raised again.
+    aborts the sinks and is re-raised.
 
     Args:
       env: a `BimanualEnvironment` (see `imfvla.tasks`).
@@ -45,7 +45,7 @@ def run_episode(
       seed: draws the start state, and whatever the actor draws.
       sinks: recorders, begun in order after the reset and ended in order after the last step.
       kind: "demonstration" or "rollout".
-      config: attached to the recording whole.
+      config: attached to the recording in full.
       metadata: policy name, nfe and the like.
       max_steps: an upper bound on the control steps, for short tests.
 

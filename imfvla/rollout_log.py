@@ -1,4 +1,4 @@
-"""The files of one evaluation: rows as they come, so that a killed one goes on, and the whole at the end."""
+"""The files of one evaluation: rows as they come, so that it can resume after a kill, and the result at the end."""
 
 import json
 import logging
@@ -25,8 +25,8 @@ PARTIAL = "episodes.partial.jsonl"  # a header with protocol and code, then rows
 class RolloutLog:
     """Holds the folder of one evaluation while it runs.
 
-    `summary` is the finished evaluation's where there is one of the same protocol, else None; `rows` are
-    those that an interrupted evaluation of the same protocol and code has left. Raises UserError where
+    `summary` is that of a finished evaluation of the same protocol, else None; `rows` are those that an
+    interrupted evaluation of the same protocol and code has left. Raises UserError where
     another process holds the folder or a file in it cannot be read or written.
     """
 
@@ -51,7 +51,7 @@ class RolloutLog:
         return self
 
     def append(self, row: Row) -> None:
-        """Keeps a row, at once on disk."""
+        """Adds a row and writes it to disk at once."""
         with clear_write_errors(self._partial):
             self._stream.write(dump_row(row))
             self._stream.flush()
@@ -71,7 +71,7 @@ class RolloutLog:
     ) -> None:
         if self._stream is not None:
             self._stream.close()
-            if not self.rows:  # nothing to go on from
+            if not self.rows:  # nothing to resume from
                 self._partial.unlink()
                 with suppress(OSError):  # unless it holds an earlier evaluation
                     self.path.rmdir()
@@ -103,9 +103,9 @@ class RolloutLog:
             found, rows = "damaged", []
         if found == header:
             self.rows = rows
-            log.info("%s: %d episodes are there already.", self.path, len(rows))
+            log.info("%s: %d episodes exist already.", self.path, len(rows))
         elif found is not None:
-            log.info("%s is damaged or of another policy, protocol or code: begun anew.", self._partial)
+            log.info("%s is damaged or of another policy, protocol or code: starting over.", self._partial)
         text = json.dumps(header) + "\n" + "".join(dump_row(row) for row in self.rows)
         write_text(self._partial, text)
         self._stream = open(self._partial, "a", encoding="utf-8")  # noqa: SIM115  closed by finish or on exit

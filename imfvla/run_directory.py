@@ -81,15 +81,13 @@ class RunDirectory:
         return self.weights_directory(self.weights_step(step)) / "policy.safetensors"
 
     def weights_step(self, step: int | str = LAST) -> int:
-        """The training step of kept weights that a checkpoint names: see `EvaluationOptions.checkpoint`.
+        """The training step of the kept weights that `checkpoint` names: see `EvaluationOptions.checkpoint`.
 
         Raises UserError where there are none.
         """
         steps = self.weight_steps()
         if not steps:
-            raise UserError(
-                f"{self.path} has no weights in checkpoints/step-*: wanted a run that has trained."
-            )
+            raise UserError(f"{self.path} has no weights in checkpoints/step-*: wanted a trained run.")
         if step == LAST:
             return steps[-1]
         if "/" in str(step):
@@ -107,28 +105,28 @@ class RunDirectory:
         try:
             config = read_yaml(path)
         except FileNotFoundError:
-            raise UserError(f"{self.path} is not a run directory: {path.name} is missing there.") from None
+            raise UserError(f"{self.path} is not a run directory: it has no {path.name}.") from None
         if not isinstance(config, dict):
             raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
         return config
 
     def refuse_links_outside(self) -> None:
-        """Raises UserError where a link would lead what is written here to somewhere else."""
+        """Raises UserError where a link would redirect writes to somewhere else."""
         home = self.path.resolve()
         for path in self.path.rglob("*"):
             if path.is_symlink() and not path.resolve().is_relative_to(home):
                 raise UserError(
-                    f"{path} leads out of the run directory, to {path.resolve()}: remove that link."
+                    f"{path} links out of the run directory, to {path.resolve()}: remove that link."
                 )
 
     def training_steps(self) -> int:
-        """The steps of the whole training. Raises UserError where the config does not say them."""
+        """The number of training steps. Raises UserError where the config does not give it."""
         return training_steps(self.config(), self.path)
 
     def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
-        """Makes the directory this config's: writes config.yaml, or compares with the one that is there.
+        """Claims the directory for this config: writes config.yaml, or compares with the existing one.
 
-        `ignored` keys may differ (they say how a run executes). Raises UserError naming those that do differ.
+        `ignored` keys may differ (they say how a run executes). Raises UserError naming other keys that differ.
         """
         if not (self.path / "config.yaml").exists():
             write_text(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False))
@@ -174,7 +172,7 @@ class RunDirectory:
 
 
 def training_steps(config: Mapping[str, Any], run: Path) -> int:
-    """The steps of the whole training of a run with this config. Raises UserError where it does not say them."""
+    """The number of training steps in a run's config. Raises UserError where it is missing or wrong."""
     training = config.get("training")
     steps = training.get("steps") if isinstance(training, Mapping) else None
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
@@ -183,7 +181,7 @@ def training_steps(config: Mapping[str, Any], run: Path) -> int:
 
 
 def step_of(steps: int, checkpoint: int | str) -> int:
-    """The step that a checkpoint names in a training of so many steps: see `EvaluationOptions.checkpoint`.
+    """The step that a checkpoint names in a training of `steps` steps: see `EvaluationOptions.checkpoint`.
 
     Raises UserError where it names none.
     """

@@ -1,4 +1,4 @@
-"""What a finished run leaves behind for good: a policy that others can evaluate, or a result without its weights."""
+"""What is kept of a finished run: a policy that others can evaluate, or a result without its weights."""
 
 import re
 import shlex
@@ -19,14 +19,14 @@ RECORDED = ("depth_attention.json",)  # what tools may have added to a run
 
 
 def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
-    """Makes `target`, which must not be there yet, whole or not at all, and returns what made_by.json says.
+    """Makes `target`, which must not exist yet, whole or not at all, and returns the content of made_by.json.
 
-    Taken are config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
-    summaries of the reporting band, and what `RECORDED` names. Raises UserError for an unfinished run, weights above
-    8 MB, no reported evaluation, or a target that exists.
+    It gets config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
+    summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
+    weights above 8 MB, no reported evaluation, or a target that exists.
     """
     if target.exists():
-        raise UserError(f"{target} is there already: remove it first.")
+        raise UserError(f"{target} exists already: remove it first.")
     state = run.status().get("state")
     if state != DONE:
         raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
@@ -58,7 +58,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
 
 
 def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
-    """The command that made a run, from the name of its directory and, where that has lost brackets, its config."""
+    """The command that made a run, from the name of its directory and, where the name lost brackets, its config."""
     values = flatten(config)
     name = "" if run.path.name == "default" else run.path.name
     overrides = []

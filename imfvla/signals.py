@@ -1,7 +1,7 @@
-"""Being asked to stop: Ctrl-C, SIGTERM (a batch system takes the node back), SIGUSR1 (its time is nearly up).
+"""Requests to stop: Ctrl-C, SIGTERM (a batch system takes the node back), SIGUSR1 (its time is nearly up).
 
-Everything that a command writes is whole or absent at any moment, so a stop may come anywhere. Training alone puts it
-off to the end of the step, to keep the steps since the last save.
+Everything that a command writes is whole or absent at any moment, so a stop may come anywhere. Only training
+delays it to the end of the step, to keep the steps since the last save.
 """
 
 import os
@@ -16,7 +16,7 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked this process to stop; what was done so far is kept, and the same command goes on."""
+    """A signal asked this process to stop; what was done so far is kept, and rerunning the same command resumes."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}")
@@ -24,15 +24,15 @@ class Stopped(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """As shells say it: 130 after Ctrl-C, 143 after SIGTERM, 138 after SIGUSR1."""
+        """The exit code by the shells' convention: 130 after Ctrl-C, 143 after SIGTERM, 138 after SIGUSR1."""
         return 128 + self.number
 
     @property
     def sentence(self) -> str:
-        """What a command says at its end."""
+        """What a command prints at its end."""
         if self.number == signal.SIGINT:
             return "Interrupted."
-        return f"Stopped by {signal.Signals(self.number).name}; the same command goes on."
+        return f"Stopped by {signal.Signals(self.number).name}; rerun the same command to resume."
 
 
 class StopRequest:
@@ -49,9 +49,9 @@ def stop_at_once() -> None:
 
 @contextmanager
 def stoppable() -> Iterator[StopRequest]:
-    """Inside, each of `SIGNALS` raises `Stopped` where the process happens to be.
+    """Inside the block, each of `SIGNALS` raises `Stopped` wherever the process is.
 
-    It is noted in what is yielded too, since libraries may turn what is raised within them into errors of their own.
+    The yielded request notes it too, since libraries may turn exceptions raised inside them into their own errors.
     While modules are imported it ends the process instead: the import system drops exceptions of its callbacks.
     """
     request = StopRequest()
@@ -68,7 +68,7 @@ def stoppable() -> Iterator[StopRequest]:
 
 @contextmanager
 def deferred_stop() -> Iterator[StopRequest]:
-    """Inside, the first of `SIGNALS` is noted in what is yielded; a second one raises `Stopped` at once."""
+    """Inside the block, the first of `SIGNALS` is noted in the yielded request; a second one raises `Stopped`."""
     request = StopRequest()
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -82,7 +82,7 @@ def deferred_stop() -> Iterator[StopRequest]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Inside, `SIGNALS` wait for the end of the block; a process that is started here begins with them blocked."""
+    """`SIGNALS` wait for the end of the block; a process started inside begins with them blocked."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
@@ -91,7 +91,7 @@ def held_back() -> Iterator[None]:
 
 
 def ignore_stops() -> None:
-    """For a process that another one ends: a terminal sends the signals to both."""
+    """Ignores `SIGNALS` in a process that its parent ends: a terminal sends them to both."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
@@ -114,7 +114,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def _handling(handler: Handler) -> Iterator[None]:
-    """Handlers belong to the main thread: in another one nothing is changed."""
+    """Only the main thread can set handlers: in another thread nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""Ranges and moments of what normalisers are fitted to."""
+"""Ranges and moments to which normalisers are fitted."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -32,7 +32,7 @@ class Statistics:
         """Statistics of states (T, S), actions (T, A) and displacements (W, Tp, A), valid (W, Tp)."""
         per_step = (moment for rows in (state, action) for moment in _moments(rows))
         counted = valid[..., None]
-        number = np.maximum(counted.sum(axis=0), 1)  # a step that is nowhere valid gets mean and deviation 0
+        number = np.maximum(counted.sum(axis=0), 1)  # a step that is never valid gets mean and deviation 0
         mean = (displacement * counted).sum(axis=0, dtype=np.float64) / number
         variance = (np.square(displacement - mean) * counted).sum(axis=0) / number
         return cls(*per_step, mean.astype(np.float32), np.sqrt(variance).astype(np.float32))

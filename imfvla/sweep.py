@@ -1,7 +1,7 @@
-"""Many jobs of one command: which there are, which have still to run, and Hydra's launcher that runs them.
+"""Many jobs of one command: which there are, which must still run, and Hydra's launcher that runs them.
 
 `-m key=1,2` gives every combination. `+sweep=NAME` gives the jobs of `conf/sweep/NAME.yaml`, each of them a list of
-overrides in Hydra's grammar or a row of the paper's tables; what else the command line says holds for all of them.
+overrides in Hydra's grammar or a row of the paper's tables; the other overrides apply to all of them.
 """
 
 import logging
@@ -50,9 +50,8 @@ class SweepOptions:
     """A file of conf/sweep."""
 
     tables: tuple[int, ...]  # of the paper: all their rows that a run answers
-    jobs: tuple[
-        tuple[str, ...], ...
-    ]  # overrides; commas and ranges in one give every combination, as with -m
+    # Overrides of each job; commas and ranges in one give every combination, as with -m.
+    jobs: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +76,7 @@ def run_sweep(
     Args:
       job: the task function.
       overrides: of the command line.
-      is_finished: tells from a job's config and directory that nothing is left to do; None where nothing tells.
+      is_finished: whether a job's config and directory show that nothing is left to do; None runs every job.
       more: a directory of configs beside `conf`, as --config-dir names it.
 
     Raises:
@@ -139,7 +138,7 @@ def plan(loader: ConfigLoader, master: DictConfig, chosen: Sequence[str]) -> lis
 
 
 def jobs_of_rows(rows: Sequence[TableRow]) -> list[tuple[str, ...]]:
-    """For each run and its weights that rows want, the overrides that train it and evaluate it as they want it."""
+    """For each run and checkpoint that rows need, the overrides that train and evaluate it as they require."""
     numbers: dict[tuple[str, ...], list[int]] = {}
     for row in rows:
         wanted = {name: getattr(row.wanted, name) for name in row.wanted.__slots__}
@@ -152,14 +151,13 @@ def jobs_of_rows(rows: Sequence[TableRow]) -> list[tuple[str, ...]]:
 
 
 def waves(planned: Sequence[Planned]) -> list[list[Planned]]:
-    """Jobs that may run at the same time: of one run directory's, the first ones, then the second ones, and so on."""
+    """Groups of jobs that may run at the same time: the first job of each run directory, then the second, and so on."""
     number: Counter[Path] = Counter()
     found: list[list[Planned]] = []
     for job in planned:
         wave = number[job.directory]
-        number[job.directory] += (
-            job.directory.name != ""
-        )  # without a directory of its own nothing can be shared
+        # A job without a directory of its own shares nothing.
+        number[job.directory] += job.directory.name != ""
         found += [[]] * (wave == len(found))
         found[wave] = [*found[wave], job]
     return found
@@ -204,7 +202,7 @@ class _Sweep:
         return self._is_finished is not None and self._is_finished(job.config, job.directory)
 
     def _batches(self, waiting: Sequence[Planned]) -> list[list[Planned]]:
-        """What the launcher gets at once; in this process job by job, so that none can end the sweep of the others."""
+        """What the launcher gets at once; one job at a time in this process, so that none can end the others' sweep."""
         batches = []
         for wave in waves(waiting):
             size = self._size or len(wave)
@@ -215,16 +213,15 @@ class _Sweep:
         try:
             returned = self._launcher.launch([list(job.overrides) for job in batch], initial_job_idx=number)
             return [failure for result in returned if (failure := result.return_value) is not None]
-        except (
-            Exception
-        ) as error:  # of the launcher or of a process that died: whatever has not finished has failed
+        # From the launcher or a process that died: every job that has not finished has failed.
+        except Exception as error:
             left = [" ".join(job.overrides) for job in batch if not self._has_finished(job)]
-            told = [Failure.of(error, self._config_name, overrides) for overrides in left[:1]]
-            return told + [Failure(other, "Not finished, for the same reason.", False) for other in left[1:]]
+            first = [Failure.of(error, self._config_name, overrides) for overrides in left[:1]]
+            return first + [Failure(other, "Not finished, for the same reason.", False) for other in left[1:]]
 
     @contextmanager
     def _counted(self, batch: Sequence[Planned], bar: Progress) -> Iterator[None]:
-        """Counts the jobs of a batch as they finish, in whatever process, and at its end those that failed too."""
+        """Counts the jobs of a batch as they finish, in any process, and at its end those that failed too."""
         ended, left = threading.Event(), list(batch)
 
         def look() -> None:
@@ -274,9 +271,9 @@ def _refuse_shared_directories(planned: Sequence[Planned]) -> None:
     first: dict[Path, Planned] = {}
     for job in planned:
         other = first.setdefault(job.directory, job)
-        if job.directory.name and (told := differences(other.config, job.config, EXECUTION_KEYS)):
+        if job.directory.name and (differing := differences(other.config, job.config, EXECUTION_KEYS)):
             raise UserError(
-                f"Two jobs of this sweep would share {job.directory}, though {'; '.join(told)}: leave "
+                f"Two jobs of this sweep would share {job.directory}, though {'; '.join(differing)}: leave "
                 "hydra.sweep.dir and hydra.sweep.subdir as they are, or let subdir name every key that differs."
             )
 
@@ -299,20 +296,20 @@ def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tup
 def _planned(loader: ConfigLoader, master: DictConfig, overrides: tuple[str, ...]) -> Planned:
     config = loader.load_sweep_config(master, list(overrides))
     before = HydraConfig.instance().cfg
-    HydraConfig.instance().set_config(config)  # the name of the directory is found in it
+    HydraConfig.instance().set_config(config)  # the directory's name is resolved from it
     try:
         directory = Path(config.hydra.sweep.dir) / str(config.hydra.sweep.subdir)
     except OmegaConfBaseException as error:
         raise UserError(
-            f"hydra.sweep.dir and hydra.sweep.subdir must follow from the config and the overrides alone, so that a "
+            f"hydra.sweep.dir and hydra.sweep.subdir must depend only on the config and the overrides, so that a "
             f"sweep finds its jobs again; found {' '.join(str(error).split())}"
         ) from error
     finally:
         HydraConfig.instance().cfg = before
     if _params_of(config) != _params_of(master):
         raise UserError(
-            f"{' '.join(overrides)} has hydra.sweeper.params of its own, which the job of a sweep cannot multiply: "
-            "name its experiment alone, or write its choices on the command line."
+            f"{' '.join(overrides)} has hydra.sweeper.params of its own, which a job of a sweep cannot expand: "
+            "run its experiment alone, or write its choices on the command line."
         )
     plain = composition.to_plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]))
     return Planned(overrides, plain, directory)

@@ -1,6 +1,6 @@
 """python -m imfvla.train +exp=NAME: collects what is missing, trains, evaluates and prints the table row.
 
-With -m, or +sweep=NAME for a file of conf/sweep: many of them, without those that are finished.
+With -m, or +sweep=NAME for a file of conf/sweep: many experiments, without those that are finished.
 """
 
 from imfvla.command import begin
@@ -17,17 +17,18 @@ from imfvla.run_directory import RunDirectory
 
 
 def usage() -> str:
-    """What to type, where nothing was."""
+    """What to type, printed where no override was given."""
     names = ", ".join(sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml")))
     return (
         f"Name an experiment: python -m imfvla.train +exp=NAME [key=value ...]. There are {names}. Any other override "
-        "will do too: task=transfer trains on that task with the options of conf/train.yaml. --help shows all keys."
+        "works too: task=transfer trains on that task with the options of conf/train.yaml. --help shows all keys."
     )
 
 
 @entry_point("train", is_complete, usage)
 def main(config: dict[str, Any]) -> None:
-    from imfvla.experiment import run_experiment  # after the config is composed: a slip is told at once
+    # Imported late, so that a mistake in the config is reported at once.
+    from imfvla.experiment import run_experiment
 
     run_experiment(config, RunDirectory(output_directory()))
 

@@ -1,4 +1,4 @@
-"""Tensors that travel between data, policy and loop.
+"""Tensors passed between data, policy and loop.
 
 Shapes: B batch, To observed steps, V views, H W pixels, S state, L instruction words, Tp predicted steps, A action.
 """
@@ -25,7 +25,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Observations with the actions that followed them."""
+    """Observations with the actions that followed."""
 
     obs: Observation
     actions: Tensor  # float32 (B, Tp, A)  physical units; actions[:, 0] is applied right after the last observation

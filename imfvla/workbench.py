@@ -21,7 +21,7 @@ Build = Callable[[Path, int], tuple[Any, Any]]  # run directory, training step -
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What the episodes of an evaluation have in common. Pickled, sent to the workers."""
+    """What the episodes of an evaluation share. Pickled and sent to the workers."""
 
     build: Build
     run: Path
@@ -50,7 +50,7 @@ def load_workbench(run: Path, step: int) -> tuple[Any, Any]:
 
 
 def gl_renderer(job: Job) -> str:
-    """What draws the cameras, by its own name, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+    """The name of the renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
 
     def ask() -> str:
         from OpenGL import GL  # here, since the platform is chosen when the environment is built
@@ -68,12 +68,12 @@ def roll_out(job: Job, seed: int) -> dict[str, Any]:
 
 
 def record(job: Job, expected: Row, path: Path) -> None:
-    """Plays an evaluated episode again, into an MCAP file and a video of the same name.
+    """Replays an evaluated episode into an MCAP file and a video of the same name.
 
-    Raises RuntimeError where it does not come out as before: then the simulator, the policy or the noise
+    Raises RuntimeError where the outcome differs: then the simulator, the policy or the noise
     is not determined by the seed, and no number of the evaluation can be trusted.
     """
-    from imfvla.recording import McapSink, VideoSink  # what writes videos is needed here alone
+    from imfvla.recording import McapSink, VideoSink  # imported here: nothing else writes videos
 
     env, _ = _bench(job.build, job.run, job.step)
     sinks = [

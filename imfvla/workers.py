@@ -1,6 +1,6 @@
-"""Work shared out to fresh processes with one thread each, or done in this one.
+"""Work distributed to fresh processes with one thread each, or done in this one.
 
-A process that dies, or takes longer than it may (a graphics driver that hangs), is replaced, and its call made again.
+A process that dies or exceeds its time limit (a graphics driver that hangs) is replaced, and its call is repeated.
 """
 
 import copy
@@ -65,11 +65,11 @@ class Pool:
                         raise value
                     yield value
         finally:
-            for worker in busy:  # somebody stopped listening: nobody wants the results
+            for worker in busy:  # the caller stopped reading: nobody needs the results
                 self._workers[self._workers.index(worker)] = _Worker(after=worker)
 
     def _outcomes(self, busy: dict["_Worker", Any]) -> list[tuple["_Worker", Any]]:
-        """What has come of the calls under way: at least one result or loss."""
+        """The outcomes of the calls under way: waits for at least one result or loss."""
         while True:
             timeout = None
             if self._timeout_s is not None:
@@ -92,10 +92,10 @@ class Pool:
         self._workers[self._workers.index(worker)] = _Worker(after=worker)
         if attempts == MAX_ATTEMPTS:
             raise UserError(
-                f"A worker process {loss.what}, {attempts} times over the same episode: {loss.remedy}. Then run the "
-                "same command again; finished episodes are kept."
+                f"A worker process {loss.what}, {attempts} times over the same episode: {loss.remedy}. Then rerun the "
+                "same command; finished episodes are kept."
             )
-        log.warning("A worker process %s: its episode is made again in a fresh one.", loss.what)
+        log.warning("A worker process %s: its episode is repeated in a fresh one.", loss.what)
 
     def close(self) -> None:
         for worker in self._workers:
@@ -107,8 +107,8 @@ def worker_pool(count: int, timeout_s: float | None = None) -> Iterator[Here | P
     """Yields `run_all(function, calls)`: results of `function(*arguments)` for each call, as they complete.
 
     The work is done in `count` fresh processes with one thread each, or in this one for 0. A process that dies or
-    takes more than `timeout_s` over a call is replaced, and the call made again; `run_all.incidents` counts these.
-    Raises UserError where a call meets with that three times.
+    takes more than `timeout_s` for a call is replaced, and the call is repeated; `run_all.incidents` counts these.
+    Raises UserError where that happens to a call three times.
     """
     if count == 0:
         yield Here()
@@ -129,7 +129,7 @@ def worker_pool(count: int, timeout_s: float | None = None) -> Iterator[Here | P
 
 @dataclass(frozen=True, slots=True)
 class _Lost:
-    """What became of a worker that answers no more, and what the user can do about it."""
+    """What happened to a worker that no longer answers, and what the user can do about it."""
 
     what: str
     remedy: str
@@ -138,12 +138,12 @@ class _Lost:
     def by_exit(cls, code: int) -> "_Lost":
         """`code` is the exit code, or minus the signal."""
         if code == -signal.SIGKILL:
-            remedy = "Linux does so where memory ends, so choose fewer workers=..."
+            remedy = "Linux does so when memory runs out, so choose fewer workers=..."
             return cls("was killed (SIGKILL)", remedy)
         if code < 0:
             remedy = "if a graphics driver crashed, try export MUJOCO_GL=osmesa"
             return cls(f"crashed ({signal.Signals(-code).name})", remedy)
-        return cls(f"ended (exit code {code})", "its own last words are printed above")
+        return cls(f"ended (exit code {code})", "its own last output is printed above")
 
 
 class _Worker:
@@ -155,13 +155,13 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        resource_tracker.ensure_running()  # it would let the signals through
+        resource_tracker.ensure_running()  # it would unblock the signals
         with held_back(), _without_main():
             self._process.start()
         theirs.close()  # so that its death closes the connection
 
     def send(self, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-        with suppress(BrokenPipeError, ConnectionResetError):  # dead already, which `receive` tells
+        with suppress(BrokenPipeError, ConnectionResetError):  # dead already, which `receive` reports
             self.connection.send((function, arguments))
 
     def receive(self) -> tuple[bool, Any] | _Lost:
@@ -215,10 +215,10 @@ def _answer(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[b
 
 
 def _sendable(error: BaseException) -> Exception:
-    """The error with the worker's traceback; where it cannot be sent, or ends a process, one that says the same."""
+    """The error with the worker's traceback; where it cannot be sent, or would end a process, a substitute."""
     trace = traceback.format_exc()
     try:
-        sent = copy.copy(error)  # made as the other process makes it
+        sent = copy.copy(error)  # rebuilt as the other process would
     except Exception:
         sent = None
     if not isinstance(sent, Exception):
@@ -228,7 +228,7 @@ def _sendable(error: BaseException) -> Exception:
 
 
 def _die_with_parent() -> None:
-    """Ends this process with the one that started it: after a SIGKILL none must go on writing files."""
+    """Ends this process with the one that started it: after a SIGKILL none may keep writing files."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])

@@ -104,7 +104,7 @@ def test_every_kind_of_core_has_its_size_and_its_latency(experiment):
     assert latency["infer1"]["core_evaluation_ms"] > 0
 
 
-def test_a_sampler_that_wastes_time_is_told():
+def test_a_sampler_that_wastes_time_is_reported():
     row = dict.fromkeys(
         ("median_ms", "p95_ms", "encoder_ms", "core_evaluation_ms", "overhead_ms", "of_parts"), 1.0
     )

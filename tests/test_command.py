@@ -1,4 +1,4 @@
-"""What every command has around it: exit codes, sentences, stops, and streams in whatever state they are."""
+"""What surrounds every command: exit codes, sentences, stops, and streams in any state."""
 
 import errno
 import os
@@ -83,7 +83,7 @@ def test_a_stop_while_modules_are_imported_ends_in_one_sentence(run, tmp_path, p
         body = "pass\n\nimport slow"
     done = run(body)
     assert done.returncode == code
-    assert done.stderr in (b"Interrupted.\n", b"Stopped by SIGTERM; the same command goes on.\n")
+    assert done.stderr in (b"Interrupted.\n", b"Stopped by SIGTERM; rerun the same command to resume.\n")
 
 
 def test_a_stop_that_a_library_turns_into_an_error_is_a_stop(capsys):
@@ -95,7 +95,7 @@ def test_a_stop_that_a_library_turns_into_an_error_is_a_stop(capsys):
             raise ImportError("initialization failed") from None
 
     assert main() == 143
-    assert capsys.readouterr().err == "Stopped by SIGTERM; the same command goes on.\n"
+    assert capsys.readouterr().err == "Stopped by SIGTERM; rerun the same command to resume.\n"
 
 
 def failing(error, cause=None):
@@ -127,7 +127,7 @@ def failing(error, cause=None):
         ),
     ],
 )
-def test_what_the_user_can_correct_is_told_in_one_sentence(capsys, error, cause, words):
+def test_what_the_user_can_correct_is_reported_in_one_sentence(capsys, error, cause, words):
     assert failing(error, cause)() == 2
     printed = capsys.readouterr().err
     assert words in printed
@@ -140,7 +140,7 @@ def test_our_own_mistakes_are_raised(error):
         failing(error)()
 
 
-def test_the_error_of_a_write_is_told_and_not_that_of_closing_the_file(capsys):
+def test_the_error_of_a_write_is_reported_and_not_that_of_closing_the_file(capsys):
     @as_command
     def main():
         try:
@@ -152,7 +152,7 @@ def test_the_error_of_a_write_is_told_and_not_that_of_closing_the_file(capsys):
     assert capsys.readouterr().err == "Cannot write metrics.jsonl.\n"
 
 
-def test_a_working_directory_that_is_gone_is_told(tmp_path, monkeypatch, capsys):
+def test_a_working_directory_that_is_gone_is_reported(tmp_path, monkeypatch, capsys):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()

@@ -62,16 +62,16 @@ def test_in_a_sweep_commas_are_choices_save_in_paths_that_are_there(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--config-name", "other"], "--config-name is not taken here: each command has one config"),
-        (["--config-path", "/tmp"], "--config-path is not taken here: name a folder of more configs"),
-        (["--experimental-rerun", "config.pickle"], "--experimental-rerun is not taken here"),
+        (["--config-name", "other"], "--config-name is not supported: each command has one config"),
+        (["--config-path", "/tmp"], "--config-path is not supported: name a folder of more configs"),
+        (["--experimental-rerun", "config.pickle"], "--experimental-rerun is not supported"),
         (["--config-dir", "/nowhere"], "--config-dir /nowhere is not a directory"),
         (["-m", "--cfg", "job"], "-m and --cfg exclude each other"),
-        (["--resolve"], "--resolve says how --cfg shows it"),
-        (["--package", "task"], "--package says what --cfg shows"),
-        (["hydra/launcher=submitit_local"], "hydra/launcher acts in a sweep alone: add -m"),
-        (["hydra.sweep.dir=x"], "hydra.sweep.dir acts in a sweep alone: add -m"),
-        (["-m", "hydra.run.dir=x"], "acts outside of a sweep alone: with -m it is hydra.sweep.dir"),
+        (["--resolve"], "--resolve acts only with --cfg"),
+        (["--package", "task"], "--package selects what --cfg shows"),
+        (["hydra/launcher=submitit_local"], "hydra/launcher acts only in a sweep: add -m"),
+        (["hydra.sweep.dir=x"], "hydra.sweep.dir acts only in a sweep: add -m"),
+        (["-m", "hydra.run.dir=x"], "acts only outside of a sweep: with -m use hydra.sweep.dir"),
     ],
 )
 def test_what_would_be_ignored_is_refused_by_name(arguments, message):

@@ -1,4 +1,4 @@
-"""Two runs against each other: what is told of them, the files that are written, and what is refused."""
+"""Two runs against each other: what is said about them, the files that are written, and what is refused."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def compare(a: Path, b: Path, nfe=None):
     return compare_runs(RunDirectory(a), RunDirectory(b), nfe)
 
 
-def test_a_better_run_is_told_and_a_worse_one_is_its_mirror(runs):
+def test_a_better_run_is_named_and_a_worse_one_is_its_mirror(runs):
     there, back = compare(*runs), compare(*reversed(runs))
     assert [duel.label for duel in there] == ["infer1", "infer2"]
     text = verdict(there[0])
@@ -47,7 +47,7 @@ def test_p_values_are_corrected_over_all_that_is_compared(runs):
     assert sum(found.p_holm for found in together.compared) > sum(found.p_holm for found in alone.compared)
 
 
-def test_no_difference_is_told_with_what_would_have_been_found(tmp_path):
+def test_no_difference_is_reported_with_what_would_have_been_found(tmp_path):
     for name, stream in (("a", 0), ("b", 9)):
         write_evaluation(make_run(tmp_path / name, name), 1, stream=stream)
     assert "Success: no difference shown (" in verdict(compare(tmp_path / "a", tmp_path / "b")[0])
@@ -137,7 +137,7 @@ def test_the_command_writes_its_files_and_prints_the_verdict(runs, tmp_path, cap
         (["{a}"], "compare needs two run directories, found 1"),
         (["{a}", "{a}"], "is given twice: wanted two runs"),
         (["{a}", "{tmp}"], "is not a run directory"),
-        (["{a}", "{b}", "nfe=1,2,3"], "nfe must be one number, or one of each run"),
+        (["{a}", "{b}", "nfe=1,2,3"], "nfe must be one number, or one for each run"),
         (["{a}", "{cut}"], "episodes.jsonl, line 20 is cut off"),
     ],
 )

@@ -19,12 +19,12 @@ from imfvla.errors import UserError
         ),
         (["+training.stps=3"], r"Unknown key training\.stps"),
         (["training.steps.more=3"], r"Unknown key training\.steps\.more"),
-        (["+seed=3"], r"seed is known already: write seed=\.\.\. without a plus sign"),
+        (["+seed=3"], r"seed exists already: write seed=\.\.\. without a plus sign"),
         (["training.steps"], r"Cannot read the override 'training\.steps': wanted key=value"),
         (["observation.views=[front"], r"Cannot read the override"),
     ],
 )
-def test_slips_get_one_sentence_with_the_names_that_exist(overrides, message):
+def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message):
     with pytest.raises(UserError, match=message) as caught:
         compose("train", overrides)
     assert "\n" not in str(caught.value)

@@ -20,7 +20,7 @@ def command(config):
     if config["seed"] == 1:
         raise UserError("seed 1 is bad.")
     if config["seed"] == 2:
-        raise ZeroDivisionError("a slip of ours")
+        raise ZeroDivisionError("a mistake of ours")
     if config["seed"] == 3:
         raise KeyboardInterrupt
     if config["seed"] == 7:
@@ -47,17 +47,17 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
         (["+exp=nope"], 2, None),
         (["seed=3"], 130, "Interrupted.\n"),
         (["seed=102"], 130, "Interrupted.\n"),
-        (["seed=115"], 143, "Stopped by SIGTERM; the same command goes on.\n"),
-        (["seed=110"], 138, "Stopped by SIGUSR1; the same command goes on.\n"),
+        (["seed=115"], 143, "Stopped by SIGTERM; rerun the same command to resume.\n"),
+        (["seed=110"], 138, "Stopped by SIGUSR1; rerun the same command to resume.\n"),
         (
             ["seed=7"],
             2,
-            "Too many open files at data.bin: no file handle is left, raise the limit with ulimit -n 4096; run the "
-            "same command again.\n",
+            "Too many open files at data.bin: no file handle is left; raise the limit with ulimit -n 4096; rerun "
+            "the same command.\n",
         ),
     ],
 )
-def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
+def test_mistakes_are_reported_in_one_line(arguments, code, words, capfd):
     with pytest.raises(SystemExit) as exit_:
         command(arguments)
     printed = capfd.readouterr().err
@@ -68,7 +68,7 @@ def test_mistakes_are_told_in_one_line(arguments, code, words, capfd):
 
 @pytest.mark.parametrize("mode", [[], ["-m"]])
 @pytest.mark.parametrize("in_the_way", ["runs", "runs/x/seed=5/train.log"])
-def test_what_hydra_cannot_write_is_told_in_one_line(tmp_path, capfd, mode, in_the_way):
+def test_what_hydra_cannot_write_is_reported_in_one_line(tmp_path, capfd, mode, in_the_way):
     (tmp_path / in_the_way).parent.mkdir(parents=True, exist_ok=True)
     if in_the_way == "runs":
         (tmp_path / in_the_way).write_text("no directory")
@@ -89,7 +89,7 @@ def test_our_own_mistakes_show_a_traceback(capfd):
     assert exit_.value.code == 1
     printed = capfd.readouterr().err
     assert "Traceback" in printed
-    assert "a slip of ours" in printed
+    assert "a mistake of ours" in printed
 
 
 def test_unknown_override_makes_no_directory(tmp_path):
@@ -113,7 +113,7 @@ def test_leaves_the_environment_as_it_was():
     assert sys.argv == arguments
 
 
-def test_train_command_tells_a_slip_in_one_line(tmp_path):
+def test_train_command_reports_a_mistake_in_one_line(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "imfvla.train", "+exp=nope"],
         capture_output=True,
@@ -132,6 +132,6 @@ def test_a_name_that_is_a_path_is_refused_before_a_directory_is_made(tmp_path, c
     with pytest.raises(SystemExit) as exit_:
         command([f"name='{name}'"])
     assert exit_.value.code == 2
-    assert "name must have letters, digits" in capfd.readouterr().err
+    assert "name must consist of letters, digits" in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert not (tmp_path.parent / "escaped").exists()

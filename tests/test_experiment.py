@@ -65,7 +65,7 @@ def test_does_all_stages_once(calls, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"} == files
 
 
-def test_goes_on_where_it_was_stopped(calls, tmp_path, monkeypatch):
+def test_resumes_where_it_was_stopped(calls, tmp_path, monkeypatch):
     config = compose("train", TINY)
     whole, stopped = RunDirectory(tmp_path / "whole"), RunDirectory(tmp_path / "stopped")
     run_experiment(config, whole)
@@ -136,7 +136,7 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("seed=-1", r"seed must be between 0 and"),
     ],
 )
-def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, override, message):
+def test_bad_values_are_reported_before_anything_is_written(calls, tmp_path, override, message):
     with pytest.raises(UserError, match=message):
         run_experiment(compose("train", [*TINY, *override.split()]), RunDirectory(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
@@ -152,7 +152,7 @@ def test_bad_values_are_told_before_anything_is_written(calls, tmp_path, overrid
         ("demos.workers=-1", r"demos\.workers must be null or between 0"),
     ],
 )
-def test_demonstrations_that_cannot_be_recorded_are_told_before_too(calls, tmp_path, override, message):
+def test_demonstrations_that_cannot_be_recorded_are_reported_early_too(calls, tmp_path, override, message):
     with pytest.raises(UserError, match=message):
         run_experiment(compose("train", [*TINY, override]), RunDirectory(tmp_path / "run"))
     assert calls == []
@@ -191,7 +191,7 @@ def test_weights_of_another_method_are_refused(calls, tmp_path):
         load_policy(run)
 
 
-def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anything_is_done(calls, tmp_path):
+def test_an_nfe_that_the_generator_does_not_support_is_reported_before_anything_is_done(calls, tmp_path):
     run = RunDirectory(tmp_path / "run")
     with pytest.raises(UserError, match="nfe"):
         run_experiment(compose("train", [*TINY, "generator=l1"]), run)
@@ -199,7 +199,7 @@ def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anyth
     assert not run.status()
 
 
-def test_a_device_that_cannot_draw_is_told_before_anything_is_done(calls, tmp_path, monkeypatch):
+def test_a_device_that_cannot_draw_is_reported_before_anything_is_done(calls, tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "GPU-1234")
     run = RunDirectory(tmp_path / "run")
@@ -224,7 +224,7 @@ def test_pretrained_weights_are_read_where_a_training_begins_and_never_again(cal
         patched.setattr(experiment.Trainer, "_update", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run_experiment(config, run)
-    assert len(read) == 2  # to be told early what does not fit, and to train
+    assert len(read) == 2  # to find early what does not fit, and to train
     run_experiment(config, run)
     run.last_state.unlink()
     run_experiment(config, run)
@@ -232,7 +232,7 @@ def test_pretrained_weights_are_read_where_a_training_begins_and_never_again(cal
     assert len(read) == 2
 
 
-def test_foreign_weights_are_told_before_anything_is_written(calls, tmp_path):
+def test_foreign_weights_are_reported_before_anything_is_written(calls, tmp_path):
     overrides = ["encoder=resnet18", f"encoder.vision.pretrained={tmp_path}/resnet18.pth"]
     with pytest.raises(UserError, match=r"encoder\.vision\.pretrained must be null or a \.safetensors file"):
         run_experiment(compose("train", [*TINY, *overrides]), RunDirectory(tmp_path / "run"))

@@ -21,7 +21,7 @@ def test_replaces_whole(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "remedy"), [(errno.ENOSPC, "free some space"), (errno.EACCES, "may be written to")]
+    ("number", "remedy"), [(errno.ENOSPC, "free some space"), (errno.EACCES, "is writable")]
 )
 def test_failed_write_names_file_and_remedy_and_keeps_the_old(tmp_path, number, remedy):
     path = tmp_path / "file"

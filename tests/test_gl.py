@@ -139,7 +139,7 @@ def test_egl_without_the_library_of_opengl_does_not_draw(monkeypatch):
         [str(ROOT / "tools" / "doctor.py"), "--only", "gl"],
     ],
 )
-def test_a_wrong_device_is_told_in_one_sentence(tmp_path, command):
+def test_a_wrong_device_is_reported_in_one_sentence(tmp_path, command):
     wrong = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "GPU-1234", "PYTHONPATH": str(ROOT)}
     entry = subprocess.run(
         [sys.executable, *command], env=os.environ | wrong, cwd=tmp_path, capture_output=True, text=True

@@ -1,4 +1,4 @@
-"""tools/pictures.py: every picture of the documents is one that it makes, and what it lacks is told."""
+"""tools/pictures.py: every picture of the documents is one that it makes, and what it lacks is reported."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ def test_every_picture_of_the_documents_has_a_name_there():
         (["two_sentences", "--multitask", "{tmp}"], "{tmp} has no weights in checkpoints"),
     ],
 )
-def test_what_is_missing_is_told_and_nothing_written(tmp_path, arguments, message):
+def test_what_is_missing_is_reported_and_nothing_written(tmp_path, arguments, message):
     done = pictures(*(text.format(tmp=tmp_path) for text in arguments), "--out", str(tmp_path / "out"))
     assert done.returncode == 2
     assert message.format(tmp=tmp_path) in done.stderr

@@ -1,4 +1,4 @@
-"""What a bar tells where nobody watches it, and bars inside of bars on a terminal."""
+"""What a bar shows without a terminal, and bars inside bars on one."""
 
 import io
 import logging

@@ -92,7 +92,7 @@ def test_equal_runs_give_equal_files(runs, tmp_path, method, unrendered):
 
 @pytest.mark.parametrize("name", [f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")])
 def test_tables_are_byte_for_byte_those_on_file(name, tables_of_synthetic_runs):
-    """python tests/test_publication.py writes them anew, for a look at what has changed."""
+    """python tests/test_publication.py rewrites them, to review what has changed."""
     assert tables_of_synthetic_runs[Path("out", name)] == (EXPECTED / name).read_bytes()
 
 
@@ -120,7 +120,7 @@ def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrender
         (lambda runs: answer_row(runs, ROWS["socket_act"], variant="hard"), r"Table 1 mixes protocols: variant is"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_the_runs_is_told_and_nothing_written(
+def test_what_is_wrong_with_the_runs_is_reported_and_nothing_written(
     runs, tmp_path, method, unrendered, damage, message
 ):
     damage(runs)
@@ -135,7 +135,7 @@ def cut(runs: Path, name: str, keep: str | None = None) -> None:
     path.write_text(path.read_text()[:-20] if keep is None else keep)
 
 
-def test_an_unknown_row_is_told_and_nothing_written(runs, tmp_path):
+def test_an_unknown_row_is_reported_and_nothing_written(runs, tmp_path):
     mapping = tmp_path / "tables.yaml"
     mapping.write_text(PATH.read_text().replace("ACT (action chunking)", "ACT (chunking)"))
     command = [sys.executable, "-m", "imfvla.report", f"directories=[{runs}]", f"output={tmp_path / 'out'}"]
@@ -150,7 +150,7 @@ def test_an_unknown_row_is_told_and_nothing_written(runs, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_run_at_all_is_told(tmp_path, method):
+def test_no_run_at_all_is_reported(tmp_path, method):
     make_run(tmp_path / "runs" / "socket_act" / "default", "socket_act")
     with pytest.raises(UserError, match=r"No run with a finished evaluation below .*make one with"):
         publish([tmp_path / "runs", tmp_path / "nothing"], tmp_path / "out", MAPPING, method)

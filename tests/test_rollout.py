@@ -36,7 +36,7 @@ class ScriptedActor:
 
 
 class Recorder:
-    """Keeps what a sink is told; raises at a step if it is told to."""
+    """Keeps what a sink receives; raises at a chosen step."""
 
     def __init__(self, fail_at: int | None = None) -> None:
         self.events: list[str] = []
@@ -71,11 +71,8 @@ def play(
 def test_the_row_of_a_whole_episode():
     result = play(ScriptedActor())
     assert (result.num_steps, result.failure, result.success) == (40, None, True)
-    assert result.first_step_of_stage == (
-        7,
-        15,
-        23,
-    )  # the stage after the step; it is 1 once 8 steps are done
+    # The stage after the step; it is 1 once 8 steps are done.
+    assert result.first_step_of_stage == (7, 15, 23)
     assert result.total_reward == 8 * (1 + 2) + 3 * 17
     assert result.max_reward == 3
     assert result.inference_ms == (2.0, 2.0, 2.0, 2.0)

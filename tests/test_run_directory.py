@@ -47,7 +47,7 @@ def test_ignored_keys_may_differ():
     ("content", "message"),
     [(None, "is not a run directory"), ("a: [", "cannot be read as YAML"), ("- 1", "must hold a mapping")],
 )
-def test_broken_config_is_told(tmp_path, content, message):
+def test_broken_config_is_reported(tmp_path, content, message):
     if content is not None:
         (tmp_path / "config.yaml").write_text(content)
     with pytest.raises(UserError, match=message):

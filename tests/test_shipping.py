@@ -111,5 +111,5 @@ def test_what_may_not_be_shipped_is_refused_and_nothing_is_written(tmp_path, cha
 
 def test_a_shipped_policy_is_not_overwritten(tmp_path):
     (tmp_path / "shipped").mkdir()
-    with pytest.raises(UserError, match="is there already"):
+    with pytest.raises(UserError, match="exists already"):
         ship(make_run(tmp_path / "run"), tmp_path / "shipped")

@@ -1,4 +1,4 @@
-"""Sweeps: what their files ask for, that a killed one goes on, and that one failure ends no other job."""
+"""Sweeps: what their files ask for, that a killed one resumes, and that one failure ends no other job."""
 
 import json
 from functools import cache
@@ -91,7 +91,7 @@ def jobs(synthetic_demonstrations) -> list[str]:
     return [*JOBS, f"demos.directory={synthetic_demonstrations}"]
 
 
-def test_a_sweep_killed_in_the_middle_goes_on_and_ends_as_an_undisturbed_one(jobs, tmp_path, monkeypatch):
+def test_a_sweep_killed_in_the_middle_resumes_and_ends_as_an_undisturbed_one(jobs, tmp_path, monkeypatch):
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     for directory in (undisturbed, killed):
         directory.mkdir()
@@ -153,7 +153,7 @@ def test_a_run_is_complete_with_every_evaluation_that_is_asked_for(jobs, tmp_pat
     assert not is_complete(config, path)
 
 
-def test_a_launcher_that_fails_is_told_once_and_what_has_finished_counts(tmp_path):
+def test_a_launcher_that_fails_is_reported_once_and_what_has_finished_counts(tmp_path):
     launcher = mock.Mock()
     planned = [Planned((name,), {}, tmp_path / name) for name in ("a", "b", "c")]
     sweep = _Sweep(launcher, False, "train", lambda config, directory: directory.exists())
@@ -164,7 +164,7 @@ def test_a_launcher_that_fails_is_told_once_and_what_has_finished_counts(tmp_pat
     assert failures[1].text == "Not finished, for the same reason."
 
 
-def test_an_unknown_launcher_is_told_with_where_it_comes_from(capfd):
+def test_an_unknown_launcher_is_reported_with_where_it_comes_from(capfd):
     with pytest.raises(SystemExit):
         tiny_sweep.main(["-m", "seed=0,1", "hydra/launcher=submitit_slrm"])
     printed = capfd.readouterr().err
@@ -173,7 +173,7 @@ def test_an_unknown_launcher_is_told_with_where_it_comes_from(capfd):
 
 
 @pytest.mark.parametrize("name", ["socke", "table"])
-def test_an_unknown_sweep_is_told(name, capfd):
+def test_an_unknown_sweep_is_reported(name, capfd):
     with pytest.raises(SystemExit) as exit_:
         tiny_sweep.main([f"+sweep={name}"])
     assert exit_.value.code == 2

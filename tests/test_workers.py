@@ -46,12 +46,12 @@ def test_in_this_process_work_is_done_one_by_one():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        ((os._exit, (1,)), r"ended \(exit code 1\), 3 times .*: its own last words are printed above"),
+        ((os._exit, (1,)), r"ended \(exit code 1\), 3 times .*: its own last output is printed above"),
         ((signal.raise_signal, (9,)), r"was killed \(SIGKILL\), 3 times .* choose fewer workers"),
         ((signal.raise_signal, (11,)), r"crashed \(SIGSEGV\), 3 times .* export MUJOCO_GL=osmesa"),
     ],
 )
-def test_the_death_of_a_worker_is_told_with_its_reason_and_the_remedy(call, words):
+def test_the_death_of_a_worker_is_reported_with_its_reason_and_the_remedy(call, words):
     function, arguments = call
     with pytest.raises(UserError, match=words), worker_pool(1) as run_all:
         list(run_all(function, [arguments]))

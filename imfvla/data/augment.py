@@ -19,7 +19,7 @@ BLOCK = 4  # samples at a time: their int16 copies stay in the second-level cach
 
 @dataclass(frozen=True, slots=True)
 class Augmentation:
-    """Random shifts and colours, one draw for each sample and view that all its observed steps share.
+    """Random shifts and colours, drawn once for each sample and view and shared by all its observed steps.
 
     A shift moves the picture by up to `shift_px` pixels along each axis and repeats its edge (DrQ, arXiv
     2004.13649). Colours become `(x - 128) * gain + 128 + offset`, cut to 0 ... 255, with the gain drawn from

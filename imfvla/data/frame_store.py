@@ -25,9 +25,9 @@ from imfvla.recording import Episode, Recordings, read_episode, read_index
 FORMAT = 1
 IMAGES = "images.raw"
 FILES = {IMAGES, "image_steps.npy", "state.npy", "action.npy", "meta.json"}
-NUM_DECODERS = 2  # threads: decompression, pictures and checksums run outside the interpreter lock
+NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
 
-Progress = Callable[[int, int], None]  # told of (episodes done, episodes in all)
+Progress = Callable[[int, int], None]  # called with (episodes done, episodes in all)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class FrameStore:
 
     @classmethod
     def open(cls, path: str | Path) -> "FrameStore":
-        """The store that `build` left at `path`. Raises UserError where there is none or it is damaged."""
+        """The store that `build` wrote to `path`. Raises UserError where there is none or it is damaged."""
         path = Path(path)
         try:
             meta = read_json(path / "meta.json", "delete the store", mapping=True)
@@ -75,7 +75,7 @@ class FrameStore:
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
-        except Exception as error:  # a damaged byte can surface as anything
+        except Exception as error:  # a damaged byte can raise anything
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it, or choose another folder with "
                 "demos.frames_directory, and run again."
@@ -93,12 +93,12 @@ class FrameStore:
         *,
         progress: Progress | None = None,
     ) -> "FrameStore":
-        """The store of these recordings; one that is there already is kept while it is up to date.
+        """The store of these recordings; an existing one is kept while it is up to date.
 
-        It is out of date once files, views or image size are others. Episodes are decoded a few at a time,
+        It is out of date once files, views or image size differ. Episodes are decoded a few at a time,
         so memory stays low; frames of another size are resampled. Raises UserError where recordings are
         missing, damaged or without a view, where nothing can be written, and where something else is at
-        `store_path`; a store that was there is replaced by a complete one only. Concurrent builds wait for
+        `store_path`; an existing store is only replaced by a complete one. Concurrent builds wait for
         each other.
         """
         store_path = Path(store_path)
@@ -110,7 +110,7 @@ class FrameStore:
 
 
 def _source(files: Sequence[Path], views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
-    """What a store is made of: its digest tells whether it is up to date."""
+    """What a store is made from; its digest shows whether the store is up to date."""
     digest = hashlib.sha256(json.dumps([FORMAT, views, image_size]).encode())
     num_frames = 0
     for file in files:
@@ -142,7 +142,7 @@ def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], prog
     """Writes a complete store beside `store_path` and moves it there."""
     if store_path.exists() and not (store_path.is_dir() and set(os.listdir(store_path)) <= FILES):
         raise UserError(
-            f"{store_path} is where decoded frames go, but is no frame store: move it away, or choose another "
+            f"{store_path} is the place of decoded frames, but is not a frame store: move it away, or choose another "
             "folder with demos.frames_directory."
         )
     part = store_path.with_name(f".{store_path.name}.part")
@@ -198,7 +198,7 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _load(path: Path) -> np.ndarray:
-    """Memory-mapped first, so that a header that promises more than the file has is refused, not allocated."""
+    """Memory-mapped first, so that a header that states more than the file holds is refused, not allocated."""
     return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
 
 

@@ -14,7 +14,7 @@ from imfvla.data.sampler import ResumableSampler
 from imfvla.data.windows import Windows
 from imfvla.types import Batch
 
-RANDOM_STREAM = 1  # apart from the sampler's SeedSequence([seed, epoch]) by its length
+RANDOM_STREAM = 1  # differs from the sampler's SeedSequence([seed, epoch]) in length
 
 
 class Loader(Iterator[Batch]):
@@ -54,7 +54,7 @@ class Loader(Iterator[Batch]):
         return batch
 
     def batch(self, number: int) -> Batch:
-        """Batch `number`, whatever was drawn before."""
+        """Batch `number`, independent of earlier draws."""
         seeds = np.random.SeedSequence([self._sampler.seed, RANDOM_STREAM, number])
         rng = np.random.default_rng(seeds)
         batch = self._windows.batch(self._sampler.batch(number), rng)
@@ -71,7 +71,7 @@ class Loader(Iterator[Batch]):
         return self._sampler.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on where `state` was taken; what was prepared ahead is dropped."""
+        """Resumes where `state` was taken; batches prepared ahead are dropped."""
         self._sampler.load_state_dict(state)
         self._drop()
 

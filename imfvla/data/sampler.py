@@ -11,7 +11,7 @@ from imfvla.errors import UserError
 class ResumableSampler:
     """Endless batches of item indices, each epoch a new permutation of all items.
 
-    Epoch e is permuted by `SeedSequence([seed, e])`; batches run on across the border between epochs, so
+    Epoch e is permuted by `SeedSequence([seed, e])`; batches continue across the border between epochs, so
     every item is drawn once an epoch, whatever the batch size. The whole state is the number of the next
     batch.
     """
@@ -40,12 +40,12 @@ class ResumableSampler:
         return indices
 
     def state_dict(self) -> dict[str, int]:
-        """What `load_state_dict` needs to go on with the next batch."""
+        """What `load_state_dict` needs to resume at the next batch."""
         names = ("next_batch", "num_items", "batch_size", "seed")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Goes on where `state` was taken. Raises UserError where data, batch size or seed are others."""
+        """Resumes where `state` was taken. Raises UserError where data, batch size or seed differ."""
         for name in ("num_items", "batch_size", "seed"):
             if state[name] != getattr(self, name):
                 raise UserError(

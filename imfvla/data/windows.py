@@ -18,13 +18,13 @@ class Windows:
     """All decisions of a store that a policy of this horizon could have faced.
 
     A step is a decision if every step that `Horizon.observed_steps` names for it has frames. With `obs=1`
-    these are all steps with frames. With `obs>=2` a rollout looks at consecutive control steps, so the
+    these are all steps with frames. With `obs>=2` a rollout sees consecutive control steps, so the
     recordings must have frames at every step (`camera_every=1`), or where a policy of the same horizon
-    looked; recordings with gaps would leave only the first step of each episode and are refused with a
+    saw them; recordings with gaps would leave only the first step of each episode and are refused with a
     UserError.
 
-    With `paraphrases` an item's sentence is drawn among all that were recorded for its episode, otherwise it is the one
-    that was said.
+    With `paraphrases` an item's sentence is drawn from the recorded one and its paraphrases, otherwise it is the
+    recorded one.
     """
 
     def __init__(self, store: FrameStore, horizon: Horizon, *, paraphrases: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Episodes as MCAP files that Foxglove opens as they are, and as videos."""
+"""Episodes as MCAP files that open directly in Foxglove, and as videos."""
 
 from imfvla.recording.folder import Recordings
 from imfvla.recording.mcap_file import TruncatedRecording

@@ -1,4 +1,4 @@
-"""Which recordings of a folder belong together: those that are named, whatever else lies beside them."""
+"""Which recordings of a folder belong together: those that are named, whatever other files the folder holds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from imfvla.errors import UserError
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """Files of one folder, in the order of their names. `name` tells this choice of them from others."""
+    """Files of one folder, in the order of their names. `name` distinguishes this choice from others."""
 
     directory: Path
     files: tuple[Path, ...]

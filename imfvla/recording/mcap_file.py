@@ -1,4 +1,4 @@
-"""The records of an MCAP file, whichever library wrote it, and whether a file is cut off."""
+"""The records of an MCAP file, whatever library wrote it, and whether a file is cut off."""
 
 import errno
 import struct
@@ -29,9 +29,9 @@ class TruncatedRecording(UserError):
 
 
 def records(data: bytes) -> Iterator[McapRecord]:
-    """The records of a file, those of chunks unpacked, checksums verified; never more than a chunk in memory.
+    """The records of a file, chunks unpacked and checksums verified; at most one chunk is in memory.
 
-    Raises ValueError where chunks promise more than an episode can have: a small file can unpack to anything.
+    Raises ValueError where chunks state more bytes than an episode can have: a small file can unpack to any size.
     """
     reader = StreamReader(BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
     total = 0
@@ -47,7 +47,7 @@ def records(data: bytes) -> Iterator[McapRecord]:
 
 def _unpacked(chunk: Chunk) -> bytes:
     """The content of a chunk, which must have the size that its record states: a frame need not say its own."""
-    most = chunk.uncompressed_size + 1  # one more than stated tells a longer content
+    most = chunk.uncompressed_size + 1  # one byte more than stated reveals a longer content
     if chunk.compression == "zstd":
         content = zstandard.ZstdDecompressor().stream_reader(chunk.data, read_across_frames=True).read(most)
     elif chunk.compression == "lz4":
@@ -58,14 +58,14 @@ def _unpacked(chunk: Chunk) -> bytes:
         raise ValueError(f"compression {chunk.compression!r}, wanted zstd, lz4 or none")
     if len(content) != chunk.uncompressed_size:
         found = f"{len(content)}" if len(content) < most else "more"
-        raise ValueError(f"a chunk of {found} bytes that is said to have {chunk.uncompressed_size}")
+        raise ValueError(f"a chunk of {found} bytes that states {chunk.uncompressed_size}")
     return content
 
 
 def missing_end(path: Path) -> str | None:
-    """What a file that is cut off lacks: "data end" or "footer". None where it ends as MCAP files do, or is none.
+    """What a cut-off file lacks: "data end" or "footer". None where it ends as MCAP files do, or is no MCAP file.
 
-    Lengths are followed, contents left unread, so a damaged file is not taken for one that is cut off.
+    It follows lengths and reads no contents, so a damaged file is not taken for a cut-off one.
     """
     size = path.stat().st_size
     with path.open("rb") as stream:
@@ -80,7 +80,7 @@ def missing_end(path: Path) -> str | None:
         while place + RECORD_HEAD.size <= size:
             stream.seek(place)
             opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
-            if opcode == 0:  # no record has it: zeros that a file system left
+            if opcode == 0:  # no record has it: zeros left by a file system
                 return None
             place += RECORD_HEAD.size + length
             if opcode == Opcode.DATA_END and place <= size:
@@ -90,9 +90,9 @@ def missing_end(path: Path) -> str | None:
 
 @contextmanager
 def clear_read_errors(path: Path) -> Iterator[None]:
-    """Turns what goes wrong with a recording into a UserError that says what was found.
+    """Turns errors of reading a recording into a UserError that says what was found.
 
-    Only where its data is truly cut off is deleting it advised.
+    It advises deletion only where the data itself is cut off.
     """
     try:
         yield
@@ -102,12 +102,12 @@ def clear_read_errors(path: Path) -> Iterator[None]:
         raise UserError(
             f"Recording {path} does not exist: give the path of a recorded .mcap file."
         ) from error
-    except Exception as error:  # a damaged byte can surface as anything from EndOfFile to KeyError
-        # A damaged offset is an invalid argument.
+    except Exception as error:  # a damaged byte can raise anything from EndOfFile to KeyError
+        # EINVAL comes from a damaged offset.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             reason = error.strerror or error
             raise UserError(
-                f"Recording {path} cannot be read: {reason}; check the path and its rights."
+                f"Recording {path} cannot be read: {reason}; check the path and its permissions."
             ) from error
         if (missing := missing_end(path)) == "data end":
             raise TruncatedRecording(
@@ -116,11 +116,11 @@ def clear_read_errors(path: Path) -> Iterator[None]:
             ) from error
         if missing:
             raise TruncatedRecording(
-                f"Recording {path} is truncated after its data, which may be whole: copy it again, or let "
-                "`mcap recover` write it again."
+                f"Recording {path} is truncated after its data, which may be complete: copy it again, or "
+                "rewrite it with `mcap recover`."
             ) from error
         reason = f"{type(error).__name__} {error}".strip()
         raise UserError(
-            f"Recording {path} is damaged or no episode of imfvla ({reason}): restore it from a copy, or move it "
+            f"Recording {path} is damaged or not an episode of imfvla ({reason}): restore it from a copy, or move it "
             "away and collect or evaluate again."
         ) from error

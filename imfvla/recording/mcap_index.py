@@ -1,4 +1,4 @@
-"""What a recording says about itself, mostly without reading its content."""
+"""The description of a recording, mostly without reading its content."""
 
 import struct
 import zlib
@@ -25,7 +25,7 @@ from imfvla.recording.mcap_file import (
 
 @dataclass(frozen=True, slots=True)
 class EpisodeIndex:
-    """What a recording says about itself, without its content."""
+    """The description of a recording, without its content."""
 
     num_bytes: int
     num_steps: int
@@ -35,9 +35,9 @@ class EpisodeIndex:
 
 
 def read_index(path: str | Path) -> EpisodeIndex:
-    """What a recording says about itself, from its summary; the whole file is read where that does not say it.
+    """The index of a recording, from its summary; the whole file is read where the summary is not enough.
 
-    Raises UserError where the file is missing, incomplete or none of ours.
+    Raises UserError where the file is missing, incomplete or not one of ours.
     """
     path = Path(path)
     with clear_read_errors(path):
@@ -71,7 +71,7 @@ def _summarised(path: Path) -> EpisodeIndex | None:
 
 
 def _counted(path: Path) -> EpisodeIndex:
-    """The index of a file whose end does not say it all; the checksum is that of the file."""
+    """The index of a file with an incomplete summary; the checksum is that of the file."""
     data = path.read_bytes()
     topics: dict[int, str] = {}
     counts: Counter[str] = Counter()

@@ -32,14 +32,14 @@ class Episode:
     stage: np.ndarray  # int64 (T,)  after the action
     chunks: Mapping[int, np.ndarray]  # step -> float32 (Tp, 16), where the policy replanned
     image_steps: np.ndarray  # int64 (K,)  steps at which every recorded view has a frame
-    images: Mapping[str, np.ndarray]  # view -> uint8 (K, H, W, 3); empty if not asked for
+    images: Mapping[str, np.ndarray]  # view -> uint8 (K, H, W, 3); empty if not requested
 
 
 def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> Episode:
     """The whole episode at `path`, with every checksum verified.
 
     `images` says which views to decode: all, none, or those named. Raises UserError naming the file where
-    it is missing, truncated or corrupt, and where it lacks a view that is asked for.
+    it is missing, truncated or corrupt, and where it lacks a requested view.
     """
     path = Path(path)
     with clear_read_errors(path):
@@ -59,14 +59,14 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         elif isinstance(record, Metadata):
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment) and record.name == messages.CONFIG_ATTACHMENT:
-            config = parse_json(record.data)  # read, never written: its name is no path
+            config = parse_json(record.data)  # never extracted, so its name is no path
     for name in messages.RECORDS:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
     if (found := metadata[messages.EPISODE_RECORD]["format"]) != messages.FORMAT:
         raise UserError(
             f"{path} has recording format {found}, wanted {messages.FORMAT}: read it with the version of imfvla that "
-            "wrote it, or move it away and collect it again."
+            "wrote it, or move it away and collect again."
         )
     info = messages.read_info(metadata[messages.EPISODE_RECORD], config)
     result = messages.read_result(metadata[messages.RESULT_RECORD])

@@ -22,14 +22,14 @@ INFO, WARNING = 2, 3  # levels of foxglove.Log
 class McapSink:
     """An `episode.Sink` that writes `path` with the topics of `imfvla.recording.messages`.
 
-    Frames are those that the actor looked at (`Decision.images`); with `render_every`, steps divisible by
-    it that come without frames get those of `env.look()`. They are PNG if `lossless`, as training wants
-    them, else JPEG. `begin` expects `env` after its reset and `step` after the action, so what the
-    simulator shows then, frames and body poses, belongs to the step that comes next and is kept until it
-    does.
+    Frames are those that the actor saw (`Decision.images`); with `render_every`, steps divisible by
+    it that have no frames get those of `env.look()`. They are PNG if `lossless`, as training needs
+    them, else JPEG. `begin` expects `env` after its reset and `step` after the action, so the
+    frames and body poses that the simulator shows then belong to the next step and are kept until it
+    comes.
 
     The file is written beside `path` under a hidden name and renamed by `end`; `abort`, and any error while
-    writing, removes it and leaves what was at `path` before. Raises UserError naming `path` where it cannot
+    writing, removes it and leaves an earlier file at `path` unchanged. Raises UserError naming `path` where it cannot
     be written.
     """
 
@@ -107,7 +107,7 @@ class McapSink:
             self._part.unlink(missing_ok=True)
 
     def _see(self, env: Any, next_step: int) -> None:
-        """Keeps what the simulator shows now for the next step, where that step is to be recorded."""
+        """Keeps the current frames and poses for the next step, if that step is recorded."""
         moved, physics = next_step % TRANSFORMS_EVERY == 0, env.physics
         self._transforms = frame_transforms(self._bodies, physics.data) if moved else None
         self._frames = env.look() if self._render_every and next_step % self._render_every == 0 else {}
@@ -151,7 +151,7 @@ class McapSink:
 
     @contextmanager
     def _cleaning_up(self) -> Iterator[None]:
-        """Aborts when its block fails, and names the file where the file system is the reason."""
+        """Aborts when its block fails; errors of the file system become a UserError that names the file."""
         try:
             yield
         except OSError as error:

@@ -1,7 +1,7 @@
 """How an episode's parts are written as JSON messages, and read back.
 
 Every message of control step s carries the simulated time of step s, counted from a fixed epoch, so that
-equal episodes make equal files. Numbers survive exactly: a float32 is written as the float64 that equals
+equal episodes make equal files. Numbers are preserved exactly: a float32 is written as the float64 that equals
 it, a non-finite one as null.
 """
 
@@ -121,7 +121,7 @@ def read_result(record: dict[str, str]) -> EpisodeResult:
 
 
 def _checked(cls: type[T], values: dict[str, Any]) -> T:
-    """`cls(**values)`. Raises ValueError where a value is not of its field's type, which JSON does not promise."""
+    """`cls(**values)`. Raises ValueError where a value is not of its field's type, which JSON does not guarantee."""
     for name, hint in get_type_hints(cls).items():
         if name in values and not _is(values[name], hint):
             raise ValueError(f"{name} must be {hint}, found {str(values[name])[:80]}")

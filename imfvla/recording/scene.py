@@ -1,6 +1,6 @@
 """The simulated bodies for Foxglove's 3D panel: their shapes once, their poses as they move.
 
-Reads the arrays of a compiled MuJoCo model and its data, however they are bound, without importing mujoco.
+Reads the arrays of a compiled MuJoCo model and its data, from any binding, without importing mujoco.
 Quaternions become Foxglove's xyzw here and nowhere else.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from imfvla.recording.messages import stamp
 
 WORLD = "world"
-NUM_VISIBLE_GROUPS = 3  # MuJoCo's renderer shows geom groups 0-2 unless told otherwise
+NUM_VISIBLE_GROUPS = 3  # MuJoCo's renderer shows geom groups 0-2 by default
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX = 0, 2, 3, 4, 5, 6  # mjtGeom
 PLANE_THICKNESS = 0.002  # [m]
 PLANE_EXTENT = 4.0  # [m] half size drawn for an infinite plane

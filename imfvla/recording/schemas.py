@@ -1,7 +1,7 @@
 """JSON schemas of the recorded messages: Foxglove's well-known ones, and five of our own.
 
-The Foxglove schemas carry the field names of https://docs.foxglove.dev/docs/sdk/schemas, so that Foxglove
-opens a recording as it is. Our own are flat enough that numbers have plot paths, as in
+The Foxglove schemas have the field names of https://docs.foxglove.dev/docs/sdk/schemas, so that a
+recording opens directly in Foxglove. Our own are flat enough that numbers have plot paths, as in
 `/robot/state.left.joint_1`.
 """
 

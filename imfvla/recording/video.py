@@ -1,4 +1,4 @@
-"""Episodes as mp4 videos, views side by side above a line that says where the episode stands."""
+"""Episodes as mp4 videos, views side by side above a status line."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -17,7 +17,7 @@ from imfvla.files import write_remedy
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_HEIGHT, CAPTION_MARGIN = 28, 6  # [px]
-MIN_WIDTH = 480  # [px] of a row: less has no room for a legible caption
+MIN_WIDTH = 480  # [px] of a row: the least that holds a legible caption
 CAPTION_SCALE = 0.5  # of the font, at most; long captions shrink until they fit
 WHITE = (255, 255, 255)
 
@@ -94,7 +94,7 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Non
 
 
 def side_by_side(pictures: Sequence[np.ndarray], caption: str) -> np.ndarray:
-    """Pictures uint8 (H, W, 3) in a row above a line of text that fits; small ones grow by a whole factor."""
+    """Pictures uint8 (H, W, 3) in a row above a fitted line of text; small ones are enlarged by a whole factor."""
     row = np.concatenate(pictures, axis=1)
     factor = -(-MIN_WIDTH // row.shape[1])
     row = row.repeat(factor, axis=0).repeat(factor, axis=1)

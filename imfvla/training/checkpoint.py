@@ -30,7 +30,7 @@ from imfvla.training.sharding import fill, gathered
 STATE_FORMAT = "imfvla-state-1"
 WEIGHTS_FORMAT = "imfvla-policy-1"
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
-# What the loop goes on from beside the tensors, and its types.
+# What the loop resumes from besides the tensors, with types.
 DETAILS = {
     "step": (int,),
     "train_s": (int, float),
@@ -53,7 +53,7 @@ class TrainState:
 def save_state(path: Path, state: TrainState, details: Mapping[str, Any], *, writes: bool = True) -> None:
     """Writes one file atomically: tensors, and JSON-able `details` (step, logger sums, ...) in its header.
 
-    Where the state is in parts all processes call this, and one of them `writes`.
+    Where the state is sharded all processes call this, and one of them `writes`.
     """
     tensors = {f"policy/{name}": tensor for name, tensor in state.policy.state_dict().items()}
     tensors |= {f"averaged/{name}": tensor for name, tensor in state.averaged.state_dict().items()}
@@ -67,7 +67,7 @@ def save_state(path: Path, state: TrainState, details: Mapping[str, Any], *, wri
 
 
 def load_state(path: Path, state: TrainState) -> dict[str, Any]:
-    """Fills `state` from a file of `save_state` and returns its details; a misfit changes nothing."""
+    """Fills `state` from a file of `save_state` and returns its details; a mismatch changes nothing."""
     tensors, header = read_tensors(path)
     if header.get("format") != STATE_FORMAT:
         raise UserError(
@@ -80,7 +80,7 @@ def load_state(path: Path, state: TrainState) -> dict[str, Any]:
         f"adamw/{moment}/{name}": torch.zeros(()) if moment == "step" else parameter
         for name, parameter in state.policy.named_parameters()
         for moment in MOMENTS
-        if f"adamw/{moment}/{name}" in tensors  # a parameter without a gradient so far has none
+        if f"adamw/{moment}/{name}" in tensors  # a parameter that has had no gradient yet has none
     }
     _refuse_misfits(path, wanted | moments, tensors)
     with torch.no_grad():
@@ -104,7 +104,7 @@ def save_weights(
 ) -> None:
     """Writes `policy.safetensors` and `policy.json` into `directory`, which appears whole or not at all.
 
-    Where the policy is in parts all processes call this, and one of them `writes`.
+    Where the policy is sharded all processes call this, and one of them `writes`.
     """
     tensors = gathered(policy.state_dict(), keep=writes)
     if not writes:
@@ -149,7 +149,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     try:
         save_file(on_cpu, path, metadata=dict(header))
-    except SafetensorError as error:  # it wraps the system's error, whose number is in the text alone
+    except SafetensorError as error:  # it wraps the system's error, whose number appears only in the text
         number = re.search(r"os error (\d+)", str(error))
         if number is None:
             raise OSError(None, str(error)) from error
@@ -163,13 +163,15 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
-    except PermissionError as error:  # what may be whole is not said to be damaged
-        raise UserError(f"{path} cannot be read: {error.strerror or error}; check its rights.") from error
+    except PermissionError as error:  # a file that may be intact is not called damaged
+        raise UserError(
+            f"{path} cannot be read: {error.strerror or error}; check its permissions."
+        ) from error
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
-            raise  # the file is well, the machine is not
+            raise  # the machine's fault, not the file's
         raise _damaged(path, error) from error
-    except Exception as error:  # a damaged header can surface as anything, from SafetensorError to KeyError
+    except Exception as error:  # a damaged header can raise anything from SafetensorError to KeyError
         raise _damaged(path, error) from error
 
 
@@ -178,7 +180,7 @@ def _damaged(path: Path, error: Exception) -> UserError:
 
 
 def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
-    """What `save_state` was given beside the tensors. Raises UserError where it is not what the loop saves."""
+    """The details that `save_state` got. Raises UserError where they are not what the loop saves."""
     try:
         details = parse_json(header["details"])
         kinds = {key: type(details[key]) for key in DETAILS}

@@ -14,7 +14,7 @@ from imfvla.recording import Recordings
 def prepare_windows(config: Mapping[str, Any], demonstrations: Recordings) -> Windows:
     """The training items of recordings, whose frame store is built if out of date.
 
-    It lies in `demos.frames_directory`, or beside the folder of the recordings where that is null.
+    It is stored in `demos.frames_directory`, or beside the folder of the recordings where that is null.
     """
     observation = config["observation"]
     height, width = observation["image_size"]
@@ -29,14 +29,14 @@ def prepare_windows(config: Mapping[str, Any], demonstrations: Recordings) -> Wi
 
 
 def make_loader(config: Mapping[str, Any], windows: Windows) -> Loader:
-    """Augmented batches that depend on the seed and their number alone."""
+    """Augmented batches that depend only on the seed and their number."""
     augmentation = build(Augmentation, config["augmentation"], "augmentation")
     sampler = ResumableSampler(len(windows), config["training"]["batch_size"], config["seed"])
     return Loader(windows, sampler, augment=augmentation, prefetch=config["training"]["prefetch"])
 
 
 class _DecodingProgress:
-    """Opens a progress bar at the first call, since a store that is up to date makes none."""
+    """Opens a progress bar at the first call, since a store that is up to date makes no call."""
 
     def __enter__(self) -> "_DecodingProgress":
         self._bar: Progress | None = None

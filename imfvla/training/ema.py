@@ -30,7 +30,7 @@ class Ema:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Takes the weights after update `step` (0-based) in."""
+        """Averages in the weights after update `step` (0-based)."""
         pairs = list(zip(self.policy.parameters(), self._source.parameters(), self._first_steps, strict=True))
         for first in set(self._first_steps):
             if step >= first:

@@ -33,17 +33,17 @@ class MetricsLogger:
         self._skipped: int = state.get("skipped", 0) if state else 0
 
     def add(self, scalars: Mapping[str, float]) -> None:
-        """Takes in what one step measured."""
+        """Adds the scalars of one step."""
         for name, value in scalars.items():
             self._sums[name] = self._sums.get(name, 0.0) + float(value)
         self._count += 1
 
     def skip(self) -> None:
-        """Counts a step that was left out; its row says how many."""
+        """Counts a skipped step; its row has their number."""
         self._skipped += 1
 
     def write(self, step: int, **extra: float) -> None:
-        """One row: the means since the last row, and `extra` as it is."""
+        """Writes one row: the means since the last row, and `extra` unchanged."""
         row = {name: total / self._count for name, total in self._sums.items()} | extra
         if self._skipped:
             row["skipped"] = self._skipped
@@ -65,7 +65,7 @@ class MetricsLogger:
 
 
 class SilentLogger(MetricsLogger):
-    """Of the processes that write nothing."""
+    """The logger of processes that write nothing."""
 
     def __init__(self, *_: Any) -> None:
         pass

@@ -59,7 +59,7 @@ class Batches(Protocol):
 
 
 class Trainer:
-    """Trains `policy` in `run` up to `options.steps`, from the state that is there if there is one.
+    """Trains `policy` in `run` up to `options.steps`, from the saved state if there is one.
 
     `batches` begins at batch 0 and is closed at the end. `description` (JSON-able) goes beside the weights.
     """
@@ -74,7 +74,7 @@ class Trainer:
         *,
         seed: int,
         description: Mapping[str, Any],
-        processes: Alone | None = None,  # those that share every batch; None for this one alone
+        processes: Alone | None = None,  # those that share every batch; None for a single process
     ) -> None:
         self.processes = processes or Alone()
         self.processes.check(options)
@@ -92,7 +92,7 @@ class Trainer:
         self.optimiser = make_optimiser(self.policy, optim, later)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
         self.step = self.saved_step = 0
-        self.train_s = 0.0  # spent in this and earlier processes
+        self.train_s = 0.0  # spent in this process and earlier ones
         self._logger_state: dict[str, Any] | None = None
         self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
         precision: str | None = None
@@ -120,7 +120,7 @@ class Trainer:
         """
         lacking = self.step in self.options.checkpoint_steps() and self.step not in self.run.weight_steps()
         if any(self.processes.highest([lacking])):
-            self._save_weights()  # which a kill has prevented after the state was saved
+            self._save_weights()  # a kill came between saving the state and the weights
         if self.is_finished:
             return
         self.policy.train()
@@ -166,16 +166,18 @@ class Trainer:
             if stop or due:
                 self._save_state(logger)
                 last_save = time.perf_counter()
-            if self.step in keep_weights:  # after the state: the last weights say that all is saved
+            if self.step in keep_weights:  # after the state: the last weights show that everything is saved
                 self._save_weights()
             if stop:
-                log.info(f"asked to stop: the state of step {self.step} is saved, the same command goes on")
+                log.info(
+                    f"asked to stop: the state of step {self.step} is saved, rerun the same command to resume"
+                )
                 raise Stopped(stop)
 
     def _update(self, batch: Batch) -> dict[str, float] | None:
         """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
         seed = step_seed(self.seed, self.step)
-        torch.manual_seed(seed)  # for dropout and the like, which take no generator
+        torch.manual_seed(seed)  # for dropout and others that take no generator
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate(group["first_step"])
         share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
@@ -263,7 +265,7 @@ def step_seed(seed: int, step: int) -> int:
 
 
 def choose_device(wanted: str) -> torch.device:
-    """The device for cpu, cuda or auto. Raises UserError where CUDA is wanted and not there."""
+    """The device for cpu, cuda or auto. Raises UserError where CUDA is requested and missing."""
     if wanted == "cuda" and not torch.cuda.is_available():
         raise UserError("training.device is cuda, but torch finds no CUDA device: set training.device=cpu.")
     if wanted == "auto":

@@ -14,7 +14,7 @@ from imfvla.training.sharding import release, whole
 from imfvla.types import Batch
 
 STOP, SKIP = "stop", "skip"
-MAX_SKIPPED = 10  # batches in a row: more than that is no accident of the data
+MAX_SKIPPED = 10  # batches in a row: more is no accident of the data
 SHOWN = 4
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ class NonFinite:
     in_a_row: int = 0
 
     def found(self, what: str, value: float, step: int, cause: str, kept: str) -> None:
-        """Tells of it, and returns where the batch is to be skipped. Raises UserError where training is to stop."""
+        """Logs it and returns if the batch is to be skipped. Raises UserError if training is to stop."""
         self.in_a_row += 1
         where = f"at step {step + 1}, batch {step}: the {what} is {value}"
         if self.wanted == SKIP and self.in_a_row <= MAX_SKIPPED:
@@ -35,22 +35,22 @@ class NonFinite:
             return
         advice = "Lower optim.lr or optim.clip_factor, or set training.precision=fp32"
         if self.wanted == STOP:
-            advice += ", or training.on_non_finite=skip to leave such batches out"
+            advice += ", or training.on_non_finite=skip to skip such batches"
         else:
             advice = f"{self.in_a_row} batches in a row were like that. {advice}"
         raise UserError(f"Training stopped {where}; {kept}. It comes from {cause}. {advice}.")
 
 
 def name_cause(policy: nn.Module, batch: Batch, seed: int, items: Sequence[str]) -> str:
-    """The rows of a batch, as named by `items`, whose own loss or gradient is not finite; all where none is alone.
+    """The rows of a batch, as named by `items`, whose own loss or gradient is not finite; all if there is none.
 
-    Each row's loss is computed once more with the random numbers that it had in the batch. Leaves no gradients.
+    Each row's loss is recomputed with the random numbers that it had in the batch. Leaves no gradients.
     """
     size = len(batch.actions)
     guilty = [row for row in range(size) if not _is_finite(policy, batch, seed, row, size)]
     policy.zero_grad(set_to_none=True)
     if not guilty:
-        return f"no row alone, but the weights or all of: {_listed(items)}"
+        return f"no single row, but the weights or all of: {_listed(items)}"
     return _listed([items[row] for row in guilty])
 
 

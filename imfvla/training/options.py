@@ -6,7 +6,7 @@ from typing import Annotated
 from imfvla.options import SHARE_BELOW_1, above, at_least, one_of, require, within
 from imfvla.training.sharding import SHARDINGS
 
-# Far beyond what is of use: what is larger is a typing error, and would fail late.
+# Far beyond useful values: anything larger is a typo and would fail late.
 MAX_STEPS, MAX_BATCH, MAX_CHECKPOINTS, MAX_PREFETCH, MAX_THREADS = 10**9, 10**6, 10**4, 1024, 1024
 
 
@@ -17,20 +17,17 @@ class TrainingOptions:
     steps: Annotated[int, within(1, MAX_STEPS)]
     batch_size: Annotated[int, within(1, MAX_BATCH)]
     log_every: Annotated[int, at_least(1)]  # steps between rows of metrics
-    save_every_s: Annotated[
-        float, at_least(0)
-    ]  # seconds between states to resume from; 0 saves after each step
-    checkpoints: Annotated[
-        int, within(1, MAX_CHECKPOINTS)
-    ]  # weights kept, evenly spaced, the last one at the end
+    # Seconds between states to resume from; 0 saves after each step.
+    save_every_s: Annotated[float, at_least(0)]
+    # How many weights are kept, evenly spaced, the last ones at the end.
+    checkpoints: Annotated[int, within(1, MAX_CHECKPOINTS)]
     prefetch: Annotated[int, within(1, MAX_PREFETCH)]  # batches prepared ahead
     precision: Annotated[str, one_of("fp32", "bf16", "auto")]
     compile: bool
     device: Annotated[str, one_of("cpu", "cuda", "auto")]
-    threads: (
-        Annotated[int, within(1, MAX_THREADS)] | None
-    )  # OpenMP's of a process, None for its share of the cores
-    sharding: Annotated[str, one_of(*SHARDINGS)]  # whether each of several processes holds all of the policy
+    # Of OpenMP in a process; None for its share of the cores.
+    threads: Annotated[int, within(1, MAX_THREADS)] | None
+    sharding: Annotated[str, one_of(*SHARDINGS)]  # whether each of several processes holds the whole policy
     on_non_finite: Annotated[str, one_of("stop", "skip")]  # at a batch whose loss or gradient is not finite
 
     def __post_init__(self) -> None:

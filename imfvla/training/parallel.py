@@ -3,12 +3,12 @@
 N processes compute what one computes, each on its share of the rows of every batch:
 
 - Gradients are averaged explicitly after the backward pass. `DistributedDataParallel` would average them only where
-  its own forward is called; a loss that reaches into the policy for a Jacobian-vector product goes past it, silently.
-- Random numbers are those of the whole batch: `Shared.draws` lets whoever draws from the loss's generator draw for
-  all rows and keep those of this process, so that no generator need know of processes.
-- What follows the average (clipping, the step, the average of the weights) is done by all alike. Only process 0 writes.
+  its own forward is called; a loss that reaches into the policy for a Jacobian-vector product silently bypasses it.
+- Random numbers are those of the whole batch: under `Shared.draws`, a draw from the loss's generator is made for
+  all rows and reduced to those of this process, so that generators need not know about processes.
+- Every process does what follows the average (clipping, the step, the average of the weights). Only process 0 writes.
 
-So the state on disk does not depend on N, and a run goes on with another N.
+So the state on disk does not depend on N, and a run can resume with another N.
 """
 
 import importlib
@@ -37,7 +37,7 @@ DRAWS = (torch.rand, torch.randn, torch.randint)
 
 @dataclass(frozen=True, slots=True)
 class Alone:
-    """The one process of a training that no torchrun has started; also what several have in common with it."""
+    """The single process of a training without torchrun; also the base of several."""
 
     rank: int = 0
     size: int = 1
@@ -54,11 +54,11 @@ class Alone:
         return batch if self.size == 1 else rows(batch, slice(self.rank * count, (self.rank + 1) * count))
 
     def draws(self, rng: torch.Generator, count: int) -> AbstractContextManager[Any]:
-        """Where the loss of `count` rows is computed, as those rows of the whole batch's."""
+        """Context in which the loss of `count` rows uses the whole batch's random numbers for these rows."""
         return nullcontext() if self.size == 1 else WholeBatchDraws(rng, count, self.rank, self.size)
 
     def check(self, options: TrainingOptions) -> None:
-        """Raises UserError where a batch, or with `sharding` a policy, cannot be shared out."""
+        """Raises UserError where a batch, or with `sharding` a policy, cannot be divided."""
         if options.sharding != NONE:
             raise UserError(
                 f"training.sharding={options.sharding} needs several processes, found one: start them with "
@@ -66,15 +66,15 @@ class Alone:
             )
 
     def mean(self, values: Sequence[float]) -> list[float]:
-        """Of each value over the processes."""
+        """The mean of each value over the processes."""
         return list(values)
 
     def highest(self, values: Sequence[int]) -> list[int]:
-        """Of each value over the processes."""
+        """The highest of each value over the processes."""
         return list(values)
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Gradients become their mean over the processes, as those in parts already are."""
+        """Gradients become their mean over the processes; sharded ones already are."""
 
     def begin_alike(self, policy: nn.Module) -> None:
         """The weights become those of process 0."""
@@ -84,7 +84,7 @@ class Alone:
         return mine
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Waits until all processes are here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +146,12 @@ def joined_processes(device: str) -> Iterator[Alone]:
     local_size = int(os.environ.get("LOCAL_WORLD_SIZE", size))
     store, rank, _ = next(dist.rendezvous("env://", timeout=TIMEOUT))
     if local_size == size:
-        # torchrun keeps its store over a restart, and with it the addresses of the processes that are gone. On
-        # several machines the number of restarts is not common knowledge; docs/reliability.md says what to do there.
+        # torchrun keeps its store over a restart, and with it the addresses of dead processes. Several machines do
+        # not agree on the number of restarts; docs/reliability.md says what to do there.
         store = dist.PrefixStore(f"restart {os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
-    # A group that anything holds outlives destroy_process_group, and its threads the interpreter, which gloo's now and
-    # then abort. The functions of this module take the group of the moment as a default when they are imported, which
-    # the first optimiser does: imported here, they hold none.
+    # A group that is still referenced outlives destroy_process_group, and its threads outlive the interpreter, which
+    # gloo's threads sometimes abort. At its import, which the first optimiser triggers, the functions of this module
+    # take the current group as a default: imported here, before there is a group, they hold none.
     importlib.import_module("torch.distributed.nn.functional")
     backend = "nccl" if on_gpu else "gloo"
     dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
@@ -169,7 +169,7 @@ def rows(batch: Batch, chosen: slice) -> Batch:
 
 
 class WholeBatchDraws(TorchFunctionMode):
-    """Inside, random numbers of `count` rows are rows `rank` * `count` and on of what `size` times as many would get.
+    """Inside, random numbers of `count` rows are rows `rank` * `count` onwards of a draw for `size` times as many.
 
     A draw is of rows where its first dimension is a multiple of `count`: the draws of an observation lie together.
     What is drawn from `rng` is covered, and dropout, which draws from torch's own; other shapes are drawn by all
@@ -227,5 +227,5 @@ def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
 
 
 def _device() -> torch.device:
-    """Of small messages: nccl sends from GPUs only."""
+    """The device of small messages: nccl sends only from GPUs."""
     return torch.device("cuda" if dist.get_backend() == "nccl" else "cpu")

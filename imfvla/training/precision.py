@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch.nn import functional as F
 
-ADVANTAGE = 1.2  # bf16 has to be this much faster to be worth its rounding
+ADVANTAGE = 1.2  # bf16 must be this much faster to justify its rounding
 
 
 def choose_precision(wanted: str, device: torch.device) -> str:

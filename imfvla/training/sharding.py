@@ -1,14 +1,14 @@
-"""Training of which every process holds a part: `training.sharding=full`, by FSDP2 of PyTorch (arXiv 2304.11277).
+"""Training in which every process holds a shard: `training.sharding=full`, by FSDP2 of PyTorch (arXiv 2304.11277).
 
-- In parts: parameters, gradients, AdamW's moments, the average of the weights.
+- Sharded: parameters, gradients, AdamW's moments, the average of the weights.
 - Whole in every process: buffers and activations; from the beginning of a loss to the end of its backward pass the
   weights (those of the encoder not between its passes) and the gradients, until they are scattered; the state while it
   is read. Process 0 gathers the state to write it.
-- FSDP acts where the forward method of a unit is called. A loss calls that of the encoder, but reaches past those of
-  the core and its blocks (keys and values of a context, a Jacobian-vector product), so that these would stay in parts.
-  The units are therefore the encoder and all else, and the loss itself is what FSDP is told to take for the latter's
+- FSDP acts where the forward method of a unit is called. A loss calls that of the encoder, but bypasses those of
+  the core and its blocks (keys and values of a context, a Jacobian-vector product), so that these would stay sharded.
+  The units are therefore the encoder and everything else, and the loss itself is registered with FSDP as the latter's
   forward method.
-- Files hold whole tensors under their usual names: whoever reads them need not know how they were trained.
+- Files hold whole tensors under their usual names: a reader need not know how they were trained.
 """
 
 import gc
@@ -26,9 +26,9 @@ SHARDINGS = (NONE, FULL)
 
 
 def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -> None:
-    """Leaves every process its part of the parameters of `module`, a policy, which are alike in all of them.
+    """Leaves every process its shard of the parameters of `module`, a policy, which are equal in all of them.
 
-    `loss` names the method before which they are gathered; after its backward pass every process has its part of the
+    `loss` names the method before which they are gathered; after its backward pass every process has its shard of the
     gradients' mean over the processes. Raises UserError where a parameter cannot be divided.
     """
     if scalars := [name for name, parameter in module.named_parameters() if parameter.ndim == 0]:
@@ -36,7 +36,7 @@ def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -
             f"training.sharding={FULL} divides parameters along their first dimension, found none in "
             f"{', '.join(scalars)}: give them shape (1,), or set training.sharding={NONE}."
         )
-    # Here: a second that nobody else need wait.
+    # Imported here: it takes a second, which only sharded training needs.
     from torch.distributed import get_world_size, init_device_mesh
     from torch.distributed.fsdp import fully_shard, register_fsdp_forward_method
 
@@ -51,17 +51,17 @@ def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -
 
 
 def is_part(tensor: Tensor) -> bool:
-    """Whether it is in parts, a DTensor; that class comes with an import of a second."""
+    """Whether it is sharded, a DTensor; importing that class takes a second."""
     return hasattr(tensor, "full_tensor")
 
 
 def whole(tensor: Tensor) -> Tensor:
-    """All of a tensor. Where it is in parts, all processes must ask for it."""
+    """The whole tensor. Where it is sharded, all processes must call this."""
     return tensor.full_tensor() if is_part(tensor) else tensor
 
 
 def gathered(tensors: Mapping[str, Tensor], *, keep: bool) -> dict[str, Tensor]:
-    """Whole tensors on the CPU, one after the other; none where a process only lends its parts."""
+    """Whole tensors on the CPU, one after the other; none where a process only contributes its shards."""
     found = {}
     for name, tensor in tensors.items():
         all_of_it = whole(tensor.detach())
@@ -71,7 +71,7 @@ def gathered(tensors: Mapping[str, Tensor], *, keep: bool) -> dict[str, Tensor]:
 
 
 def fill(tensor: Tensor, content: Tensor) -> Tensor:
-    """Copies whole `content` into a tensor, or this process's part of it into one in parts; returns `tensor`."""
+    """Copies whole `content` into a tensor, or this process's shard of it into a sharded one; returns `tensor`."""
     if is_part(tensor):
         from torch.distributed.tensor import distribute_tensor
 
@@ -86,13 +86,13 @@ def fill(tensor: Tensor, content: Tensor) -> Tensor:
 
 
 def release(policy: nn.Module) -> None:
-    """After a loss without a backward pass: the weights are in parts again. Of a whole policy nothing changes."""
+    """After a loss without a backward pass: shards the weights again. Leaves a whole policy unchanged."""
     if reset := getattr(policy, "reset_iter_state", None):
         reset()
 
 
 def forget_layouts() -> None:
-    """After the last step in parts: empties PyTorch's caches of layouts, each of which holds the process group."""
+    """After the last sharded step: empties PyTorch's caches of layouts, each of which holds the process group."""
     if "torch.distributed.tensor" not in sys.modules:
         return
     from torch.distributed.tensor import _redistribute

@@ -308,7 +308,7 @@ def test_a_chunk_of_another_size_than_stated_is_refused(tmp_path, scene, monkeyp
 
     monkeypatch.setattr(Chunk, "write", lie)
     rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap", compression=compression)
-    with pytest.raises(UserError, match=r"b\.mcap .* that is said to have"):
+    with pytest.raises(UserError, match=r"b\.mcap .* that states"):
         read_episode(tmp_path / "b.mcap")
 
 

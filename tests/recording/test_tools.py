@@ -17,14 +17,12 @@ TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def run(tool: str, *arguments: object) -> int:
-    """Exit status of a tool."""
-    before = sys.argv
-    sys.argv = [tool, *map(str, arguments)]
-    try:
+    """Exit status of a tool, without `begin`, which would take over this process's streams and signals."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("imfvla.command.begin", lambda: None)
+        patch.setattr(sys, "argv", [tool, *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             runpy.run_path(str(TOOLS / tool), run_name="__main__")
-    finally:
-        sys.argv = before
     return ended.value.code or 0
 
 
@@ -42,7 +40,7 @@ def test_check_names_the_broken_one(synthetic_demonstrations, capsys):
     assert "2 of 3 files ok" in out
 
 
-def test_check_goes_on_after_files_of_others(synthetic_demonstrations, capsys):
+def test_check_continues_after_files_of_others(synthetic_demonstrations, capsys):
     with (synthetic_demonstrations / "a.mcap").open("wb") as stream:
         writer = Writer(stream, use_statistics=False)
         writer.start()

@@ -123,7 +123,7 @@ class TestFullDisk:
         assert RunDirectory(tmp_path).weight_steps() == []
         assert not list(tmp_path.rglob("*.tmp"))
 
-    def test_system_error_inside_safetensors_is_told(self, tmp_path, monkeypatch):
+    def test_system_error_inside_safetensors_is_reported(self, tmp_path, monkeypatch):
         def fails(*_, **__):
             raise checkpoint.SafetensorError(
                 'Error: I/O error: No space left on device (os error 28) at path "/a"'
@@ -135,7 +135,7 @@ class TestFullDisk:
         assert caught.value.errno == errno.ENOSPC
 
 
-def test_run_without_weights_is_told(tmp_path):
+def test_run_without_weights_is_reported(tmp_path):
     with pytest.raises(UserError, match="has no weights"):
         RunDirectory(tmp_path).policy_weights()
     save_weights(RunDirectory(tmp_path).weights_directory(4), TinyPolicy(), {})

@@ -44,6 +44,6 @@ def test_what_is_no_frame_store_is_not_replaced(synthetic_demonstrations, tmp_pa
     mine = tmp_path / "frames" / "demonstrations_frames_32x32" / "thesis.tex"
     mine.parent.mkdir(parents=True)
     mine.write_text("results")
-    with pytest.raises(UserError, match="is no frame store: move it away"):
+    with pytest.raises(UserError, match="is not a frame store: move it away"):
         windows(Recordings.of(synthetic_demonstrations), f"demos.frames_directory={tmp_path}/frames")
     assert mine.read_text() == "results"

@@ -22,7 +22,7 @@ def test_rows_are_means_since_the_last_row(tmp_path):
     ]
 
 
-def test_interval_goes_on_from_its_state(tmp_path):
+def test_interval_resumes_from_its_state(tmp_path):
     logger = MetricsLogger(RunDirectory(tmp_path / "a"), 0)
     logger.add({"loss": 0.1})
     state = json.loads(json.dumps(logger.state()))
@@ -41,7 +41,7 @@ def test_cuts_off_later_rows_and_half_lines(tmp_path):
     assert run.metrics.read_text() == '{"step": 1}\n{"step": 2}\n'
 
 
-def test_damaged_row_is_told(tmp_path):
+def test_damaged_row_is_reported(tmp_path):
     (tmp_path / "metrics.jsonl").write_text('{"step": 1}\noops\n{"step": 3}\n')
     with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is not JSON"):
         read_metrics(tmp_path / "metrics.jsonl")

@@ -58,7 +58,7 @@ def test_parts_compute_and_save_what_the_whole_does(runs):
     assert described[0].keys() == described[1].keys()
 
 
-def test_a_state_of_the_whole_goes_on_in_parts_and_back(runs):
+def test_a_state_of_the_whole_policy_resumes_sharded_and_back(runs):
     assert_close(runs / "begun", runs / "whole")
     assert train(Job(str(runs / "handed-over")), Alone()) == 3
     assert_close(runs / "handed-over", runs / "whole")
@@ -68,7 +68,7 @@ def test_a_batch_that_is_not_finite_is_left_out(runs):
     assert_close(runs / "skipping-sharded", runs / "skipping")
 
 
-def test_a_parameter_that_cannot_be_divided_is_told():
+def test_a_parameter_that_cannot_be_divided_is_reported():
     module = nn.Module()
     module.scale = nn.Parameter(torch.ones(()))
     with pytest.raises(UserError, match=r"sharding=full divides parameters .* found none in scale"):
