@@ -28,9 +28,8 @@ def test_jobs_run_elsewhere_their_failures_come_back_and_finished_ones_are_skipp
         *tiny_sweep.OVERRIDES,
         f"demos.directory={synthetic_demonstrations}",
     ]
-    done = tiny_sweep.launch(
-        command, tmp_path, RAY_worker_niceness="0"
-    )  # 15 by default: last of all on a busy machine
+    # with the default niceness of 15, Ray's workers starve on a busy machine
+    done = tiny_sweep.launch(command, tmp_path, RAY_worker_niceness="0")
     assert done.returncode == 2, done.stderr
     assert done.stderr.endswith(
         "Jobs: 2, of which 0 were finished before, 1 ran and 1 failed.\nseed 13 is bad.\n"
@@ -40,8 +39,7 @@ def test_jobs_run_elsewhere_their_failures_come_back_and_finished_ones_are_skipp
     assert len(list(path.glob("rollouts/*/episodes.jsonl"))) == 1
     assert len((tmp_path / tiny_sweep.UPDATES).read_text().splitlines()) == 2
 
-    again = tiny_sweep.launch(
-        [text.replace("0,13", "0") for text in command], tmp_path
-    )  # has nothing to launch
+    # nothing is left to launch
+    again = tiny_sweep.launch([text.replace("0,13", "0") for text in command], tmp_path)
     assert again.returncode == 0, again.stderr
     assert "Jobs: 1, of which 1 were finished before, 0 ran and 0 failed." in again.stderr

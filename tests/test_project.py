@@ -70,9 +70,8 @@ def test_documents_name_only_what_exists(document):
 @pytest.mark.parametrize("command", commands_in(DOCUMENTS))
 def test_commands_in_documents_compose_and_build(command):
     entry, *arguments = command.split()
-    overrides = [
-        re.sub(r"^(?!nfe=)([^=]+=[^,]+),.*$", r"\1", text) for text in arguments if "=" in text
-    ]  # of a sweep
+    # of a sweep, the first choice
+    overrides = [re.sub(r"^(?!nfe=)([^=]+=[^,]+),.*$", r"\1", text) for text in arguments if "=" in text]
     overrides = [re.sub(r"^nfe=(.*)$", r"nfe=[\1]", text) for text in overrides]
     config = compose(entry, overrides)
     if entry == "train":

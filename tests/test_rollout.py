@@ -71,11 +71,8 @@ def play(
 def test_the_row_of_a_whole_episode():
     result = play(ScriptedActor())
     assert (result.num_steps, result.failure, result.success) == (40, None, True)
-    assert result.first_step_of_stage == (
-        7,
-        15,
-        23,
-    )  # the stage after the step; it is 1 once 8 steps are done
+    # the stage after the step; it is 1 after 8 steps
+    assert result.first_step_of_stage == (7, 15, 23)
     assert result.total_reward == 8 * (1 + 2) + 3 * 17
     assert result.max_reward == 3
     assert result.inference_ms == (2.0, 2.0, 2.0, 2.0)
