@@ -109,7 +109,7 @@ def test_a_sampler_that_wastes_time_is_reported():
         ("median_ms", "p95_ms", "encoder_ms", "core_evaluation_ms", "overhead_ms", "of_parts"), 1.0
     )
     table = latency_table("x", {"infer1": row, "infer2": row | {"of_parts": 1.2}})
-    assert "at most 1.15 is wanted, too much for infer2." in table.notes[0]
+    assert "Limit 1.15: exceeded by infer2." in table.notes[0]
 
 
 def test_speeds_are_compared_as_the_paper_s_table_3_does():

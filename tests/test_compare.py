@@ -96,7 +96,7 @@ def test_times_of_other_machines_are_refused_and_the_rest_compared(runs, tmp_pat
     write_evaluation(other, 1, quality=0.5, number=40, machine=MACHINE | {"cpu": "another"})
     (duel,) = compare(runs[0], other)
     assert "Success: A succeeds more often" in verdict(duel)
-    assert "Speed: not compared, as" in verdict(duel)
+    assert "Speed: not compared, because" in verdict(duel)
     assert not clipped(two_runs([duel]))
 
 
@@ -106,12 +106,12 @@ def test_times_of_other_machines_are_refused_and_the_rest_compared(runs, tmp_pat
         (
             {"noise_seed": 3},
             None,
-            r"no pairs: noise_seed is 0 of .* and 3 of .*Evaluate both in the same way",
+            r"cannot be paired: noise_seed is 0 of .* and 3 of .*Evaluate both with the same protocol",
         ),
-        ({"variant": "hard"}, None, r"no pairs: variant is"),
-        ({}, [7], r"core=standard,seed=1 was not evaluated with nfe 7, but with 1, 2"),
-        ({}, [1, 7], r"c was not evaluated with nfe 7, but with 10"),
-        ({}, None, r"nfe 1, 2 and .*c with 10: no number is common; name one of each"),
+        ({"variant": "hard"}, None, r"cannot be paired: variant is"),
+        ({}, [7], r"core=standard,seed=1 was evaluated with nfe 1, 2, not with 7"),
+        ({}, [1, 7], r"c was evaluated with nfe 10, not with 7"),
+        ({}, None, r"nfe 1, 2 and .*c with 10: no NFE is common to both; name one of each"),
     ],
 )
 def test_what_is_no_pair_is_refused(runs, tmp_path, change, nfe, message):
@@ -135,7 +135,7 @@ def test_the_command_writes_its_files_and_prints_the_verdict(runs, tmp_path, cap
     ("arguments", "message"),
     [
         (["{a}"], "compare needs two run directories, found 1"),
-        (["{a}", "{a}"], "is given twice: wanted two runs"),
+        (["{a}", "{a}"], "is given twice: name two different runs"),
         (["{a}", "{tmp}"], "is not a run directory"),
         (["{a}", "{b}", "nfe=1,2,3"], "nfe must be one number, or one for each run"),
         (["{a}", "{cut}"], "episodes.jsonl, line 20 is cut off"),

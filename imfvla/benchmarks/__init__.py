@@ -1,1 +1,1 @@
-"""What this machine does in a second: simulation, demonstrations, training, inference."""
+"""How fast this machine is: simulation, demonstrations, training, inference."""

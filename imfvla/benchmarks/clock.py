@@ -20,7 +20,7 @@ def times_ms(functions: Sequence[Callable[[], object]], calls: int, warm_up: int
 
 
 def rate(function: Callable[[], object], seconds: float) -> float:
-    """Calls per second, measured over at least `seconds` and after one call that does not count."""
+    """Calls per second, measured over at least `seconds`, after one call that does not count."""
     function()
     began, calls = time.perf_counter(), 0
     while (elapsed := time.perf_counter() - began) < seconds:
@@ -31,7 +31,7 @@ def rate(function: Callable[[], object], seconds: float) -> float:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """Torch computes with `count` threads inside."""
+    """Torch computes with `count` threads inside this context."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -14,7 +14,7 @@ from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
 from imfvla.types import Observation
 
-FEWEST_CALLS = 50  # of a sampler with many evaluations
+FEWEST_CALLS = 50  # of a sampler with many steps
 
 
 def measure_latency(
@@ -24,9 +24,9 @@ def measure_latency(
 
     `log_error` is the bootstrapped standard error of the median's logarithm, over calls as if they were independent.
 
-    The parts are the encoder with its conditioning, one evaluation of the core, and the overhead: what a chunk takes
-    beyond the encoder and n evaluations; `of_parts` is the chunk over that sum. They are timed in turn with the chunk,
-    so that all see the same machine, `calls` / n times, but not under 50 for its sake.
+    The parts are the encoder with its conditioning, one call of the core, and the overhead: what a chunk takes beyond
+    the encoder and n calls; `of_parts` is the chunk over the sum of encoder and n calls. Chunk and parts are timed in
+    turn, so that all see the same machine: `calls` / n times, at least min(50, `calls`).
     """
     env.reset(seed=0)
     obs = policy.horizon.obs

@@ -16,7 +16,7 @@ FRAMES = 50  # rendered per view
 
 
 def measure_simulation(env: Any) -> dict[str, float]:
-    """Rates of one process [1/s] and the mean over the views of the median time of a frame [ms]."""
+    """Rates of one process [1/s] and the median time of a frame [ms], averaged over the views."""
     env.reset(seed=0)
     hold = env.state()
     control = rate(lambda: _step(env, hold), MEASURE_S)

@@ -13,9 +13,9 @@ from imfvla.types import Batch, Observation
 
 
 def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any]:
-    """Counts at batch 1, of a composed config: no time is taken, weights are random.
+    """Counts at batch 1, of a composed config: nothing is timed, weights are random.
 
-    A chunk costs the encoder with its conditioning once and `n` evaluations of the core, for each n of `nfe`.
+    A chunk costs the encoder with its conditioning once and `n` calls of the core, for each n of `nfe`.
     """
     policy = build_unfitted(config)
     observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
@@ -35,7 +35,7 @@ def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any
 
 
 def core_inputs(policy: Policy, observation: Observation, noise: Tensor) -> tuple[Any, ...]:
-    """What the generator hands to the core in an evaluation, whatever its interface."""
+    """What the generator passes to the core in one call, whatever its interface."""
     seen: list[tuple[Any, ...]] = []
     hook = policy.core.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
     try:

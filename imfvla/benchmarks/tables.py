@@ -1,4 +1,4 @@
-"""What `imfvla.bench` has measured, as tables for people."""
+"""The measurements of `imfvla.bench` as tables for people."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,14 +8,14 @@ from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.table import Table, number
 
 PARTS_OF_A_STEP = ("data", "encoder", "core", "jvp", "backward", "optimiser")
-MOST_OF_PARTS = 1.15  # a chunk may cost this share of its encoder and evaluations of the core
-NORMAL_95 = 1.96  # standard errors on each side
+MOST_OF_PARTS = 1.15  # a chunk may cost this multiple of its encoder and calls of the core
+NORMAL_95 = 1.96  # half a 95% interval in standard errors
 SPEEDS = ("inference_ms_mean", "inference_fps")  # comparisons of Table 3 that follow from times of a chunk
 
 
 def size_table(rows: Sequence[tuple[str, str, Mapping[str, Any]]]) -> Table:
     """Of experiments at scales, with the result of `measure_size` each."""
-    columns = ("experiment", "scale", "parameters [M]", "trained [M]", "encoder", "core evaluation", "chunk")
+    columns = ("experiment", "scale", "parameters [M]", "trained [M]", "encoder", "core, 1 NFE", "chunk")
     cells = tuple(
         (
             experiment,
@@ -32,7 +32,7 @@ def size_table(rows: Sequence[tuple[str, str, Mapping[str, Any]]]) -> Table:
 
 
 def simulation_rows(figures: Mapping[str, float]) -> tuple[tuple[str, str, str], ...]:
-    """What, value and unit of those rates of the simulation that were measured."""
+    """Name, value and unit of the rates of the simulation that were measured."""
     rates = (
         ("physics_steps_per_s", "physics steps", 0, "1/s, one process"),
         ("control_steps_per_s", "control steps", 0, "1/s, one process, not rendered"),
@@ -45,7 +45,7 @@ def simulation_rows(figures: Mapping[str, float]) -> tuple[tuple[str, str, str],
 
 
 def training_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str, str], ...]:
-    """What, value and unit of a training step and its parts."""
+    """Name, value and unit of a training step and its parts."""
     return (
         ("training samples", number(figures["samples_per_s"], 1), "1/s"),
         ("training step", number(figures["step_ms"], 1), f"ms, batch {figures['batch_size']}"),
@@ -76,12 +76,12 @@ def latency_table(experiment: str, figures: Mapping[str, Mapping[str, float]]) -
     names = ("median_ms", "p95_ms", "encoder_ms", "core_evaluation_ms", "overhead_ms", "of_parts")
     rows = tuple((sampler, *(number(row[key], 3) for key in names)) for sampler, row in figures.items())
     over = [sampler for sampler, row in figures.items() if row["of_parts"] > MOST_OF_PARTS]
-    verdict = f"too much for {', '.join(over)}" if over else "kept by all"
+    verdict = f"exceeded by {', '.join(over)}" if over else "kept by all"
     return Table(
         f"{experiment}: one action chunk [ms], batch 1, one thread, numpy to numpy",
-        ("sampler", "median", "p95", "encoder", "core evaluation", "overhead", "of its parts"),
+        ("sampler", "median", "p95", "encoder", "core, 1 NFE", "overhead", "over parts"),
         rows,
-        (f"Of its parts: over encoder and evaluations; at most {MOST_OF_PARTS} is wanted, {verdict}.",),
+        (f"Over parts: chunk / (encoder + NFE x core). Limit {MOST_OF_PARTS}: {verdict}.",),
     )
 
 
@@ -90,7 +90,7 @@ def speed_ratios(
 ) -> dict[str, dict[str, float | str]]:
     """By printed comparison of Table 3: median times of both chunks [ms], their ratio with interval, the paper's.
 
-    `latencies` are those of experiments as they stand in conf/exp; comparisons of others are left out.
+    `latencies` are of the experiments in conf/exp without overrides; other comparisons are left out.
     """
     found: dict[str, dict[str, float | str]] = {}
     for comparison in comparisons:

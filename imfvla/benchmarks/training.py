@@ -28,7 +28,7 @@ GEMM = 2048  # rows and columns of the matrices that the peak is measured with
 def measure_training(
     config: Mapping[str, Any], policy: Policy, demonstrations: Recordings, scratch: Path, steps: int
 ) -> dict[str, Any]:
-    """Trains `policy` for a few steps on recorded demonstrations, as `imfvla.train` would, and takes times.
+    """Trains `policy` for a few steps on recorded demonstrations, as `imfvla.train` would, and times the parts.
 
     The parts are means over `steps` steps [ms]: waiting for data, encoder and conditioning, core and loss
     without the Jacobian-vector product, that product, backward, and clipping with optimiser and average
@@ -71,7 +71,7 @@ def measure_training(
 
 
 def peak_flops(precision: str, device: torch.device) -> float:
-    """Floating-point operations per second of a large matrix product, with the present number of threads."""
+    """Floating-point operations per second of a large matrix product, with the current number of threads."""
     a = torch.randn(GEMM, GEMM, device=device, dtype=torch.bfloat16 if precision == "bf16" else torch.float32)
     taken = times_ms([lambda: (a @ a)[0, 0].item()], calls=5)
     return 2 * GEMM**3 / (1e-3 * float(taken.min()))
@@ -113,7 +113,7 @@ def _timed(spent: dict[str, float], part: str) -> Iterator[None]:
 
 @contextmanager
 def _timed_derivative(generator: Any, spent: dict[str, float]) -> Iterator[None]:
-    """Times `generator.derivative`, where the generator has one, apart."""
+    """Times `generator.derivative` separately, where the generator has one."""
     original = getattr(generator, "derivative", None)
     if original is None:
         yield

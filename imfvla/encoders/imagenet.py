@@ -1,6 +1,6 @@
 """ImageNet weights of torchvision's resnet18 in our ResNet18.
 
-Convolutions are taken key by key, gains and shifts of batch norms as those of the group norms in their place. Batch
+Convolutions are copied key by key; gains and shifts of batch norms go to the group norms that replace them. Batch
 statistics and the classifier have no counterpart.
 """
 

@@ -13,8 +13,8 @@ from torch.nn import functional as F
 class GridTokens(nn.Module):
     """Every feature of a view's map has its weight in every token: (B, V, C, h, w) -> (B, V * tokens, width).
 
-    The place of a feature is its index, so that where something lies is linear in what is seen and quick to learn.
-    The number of weights grows with the map: for small ones.
+    The place of a feature is its index, so that an object's position is linear in the features and quick to learn. The
+    number of weights grows with the map: use it for small maps.
     """
 
     def __init__(self, *, views: int, channels: int, grid: tuple[int, int], width: int, tokens: int) -> None:
@@ -33,10 +33,10 @@ class AttendedTokens(nn.Module):
     """Each of `maps` attention maps of a view yields its mean position and the mean of a few features under it.
 
     A generalised spatial softmax (arXiv 1504.00702): positions make the tokens precise to a fraction of a feature,
-    features tell what lies there. Every view has weights of its own. (B, V, C, h, w) -> (B, V * tokens, width).
+    features say what lies there. Every view has weights of its own. (B, V, C, h, w) -> (B, V * tokens, width).
 
     Features and scores are normalised over the positions of a picture: what stands out is attended to from the
-    start. Without it the average of the background outweighs a small thing on a table a thousand to one, and a policy
+    start. Without it the average of the background outweighs a small object on a table a thousand to one, and a policy
     learns to ignore its cameras.
     """
 

@@ -164,7 +164,7 @@ class ResNet18(nn.Module):
         )
 
     def initialise_from_pretrained(self) -> None:
-        """Takes ImageNet's weights where `pretrained` names them. Raises UserError where the file does not fit."""
+        """Loads ImageNet's weights if `pretrained` names a file. Raises UserError where the file does not fit."""
         if self.pretrained is not None:
             load_torchvision(self, self.pretrained)
 

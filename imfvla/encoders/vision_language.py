@@ -24,7 +24,7 @@ MIN_STATE_SCALE = 5e-3  # rad, or share of a gripper's opening
 class TextEncoder(nn.Module):
     """Words in their sentence: ids (B, W) -> (B, W, D), by embeddings, positions and self-attention.
 
-    Places without a word are seen by no word and come out as one learned token.
+    No word attends to a place without a word; such places become one learned token.
     """
 
     def __init__(self, width: int, heads: int, depth: int, mlp_ratio: float) -> None:
@@ -51,7 +51,7 @@ class VisionLanguageEncoder(Backbone, nn.Module):
     `view_tokens` builds what turns the maps of `vision` into tokens from (views, channels, grid, width).
     pretrained: a safetensors file with the weights of all but the state's projection, under the names that a policy's
       checkpoint gives them; None for random ones.
-    frozen: those weights are not trained. Raises UserError where there are none to freeze.
+    frozen: those weights are not trained. Raises UserError if there are none.
     """
 
     key = "encoder"

@@ -11,7 +11,7 @@ from imfvla.figures.style import BLUE, GREY, INK, WIDTH, new_figure, style
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.results import Result
 
-BAR = 0.38  # of the distance between two groups
+BAR = 0.38  # share of the distance between two groups
 
 
 def transfer_ablations(results: Sequence[Result]) -> Figure:

@@ -12,9 +12,9 @@ from imfvla.figures.diagram import Sheet
 from imfvla.figures.style import BLUE, GREEN, GREY, ORANGE, PALE, PURPLE, SKY, VERMILION, style
 
 WIDTH, HEIGHT = 128, 72
-MAX_SHOWN = 12  # sources of the residual; of more, the middle is left out
+MAX_SHOWN = 12  # sources of the residual; if there are more, the middle is left out
 STEP_COLORS = (VERMILION, BLUE, GREEN, ORANGE, PURPLE)
-# Of each generator: title, what is regressed on what, and remarks that hold whatever its options are.
+# For each generator: title, what is regressed on what, and remarks that hold for all its options.
 LEARNS = {
     "ImprovedMeanFlow": (
         "Improved Mean Flow: what is learnt",
@@ -53,7 +53,7 @@ PREDICTIONS = {"epsilon": r"$\;\epsilon$", "sample": r"$\;x$", "v": r"$\;v$"}  #
 
 
 def method_components(config: Mapping[str, Any]) -> Figure:
-    """The figure of a config that `conf/train.yaml` composed: generator, its options, evaluations, residual, depth."""
+    """The figure of a config that `conf/train.yaml` composed: generator, its options, NFE, residual, depth."""
     method = describe(config)
     with style():
         sheet = Sheet(WIDTH, HEIGHT)

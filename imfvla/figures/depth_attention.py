@@ -1,4 +1,4 @@
-"""What the sublayers of trained policies read of earlier ones: heat maps of mean Attention Residual weights."""
+"""How much the sublayers of trained policies read from earlier ones: heat maps of mean Attention Residual weights."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,12 +16,12 @@ from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
 COLUMNS = 2
 TICKS = (0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1)
-BRIGHT = 0.3  # a weight whose colour wants dark writing
+BRIGHT = 0.3  # from this weight on, the colour needs dark text
 SHORT = {"attention": "attn", "cross-attention": "cross"}
 
 
 def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
-    """What a run directory recorded, None where nothing is; `core` is that of its config.
+    """The record in a run directory, None if there is none; `core` is that of its config.
 
     Raises UserError for a file that cannot be read.
     """
@@ -78,7 +78,7 @@ def depth_attention(recorded: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _matrix(rows: Sequence[Sequence[float]]) -> np.ndarray:
-    """Weights (queries, most sources), nan where a query does not read; queries that were not asked left out."""
+    """Weights (queries, most sources), nan where a query does not read; queries that were not used are left out."""
     asked = [row for row in rows if row]
     matrix = np.full((len(asked), max(len(row) for row in asked)), np.nan)
     for index, row in enumerate(asked):

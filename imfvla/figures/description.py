@@ -1,4 +1,4 @@
-"""What a composed training config says about the method, in the words and numbers of its figures."""
+"""The method of a composed training config, in the words and numbers of the figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

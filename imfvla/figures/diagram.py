@@ -10,7 +10,7 @@ from imfvla.figures.style import GREY, INK, new_figure
 
 UNIT = 0.1  # inches
 SCALE = 1.25  # of the sizes below, in points
-SMALLEST = 5.0  # points: text that would need less does not fit and says so
+SMALLEST = 5.0  # points: text that would have to be smaller raises an error
 
 
 class Sheet:
@@ -37,7 +37,7 @@ class Sheet:
         size: float = 8.0,
         rounding: float = 1.0,
     ) -> None:
-        """A rounded box from its lower left corner, with a bold title at its top and lines of text below or amid."""
+        """A rounded box from its lower left corner, with a bold title at its top and lines of text below it, or in the middle."""
         self.axes.add_patch(
             FancyBboxPatch(
                 (x + rounding, y + rounding),
@@ -133,7 +133,7 @@ class Sheet:
         height: float,
         edge: str = "white",
     ) -> None:
-        """A row of adjoining cells that is `width` wide altogether."""
+        """A row of adjoining cells with a total width of `width`."""
         each = width / len(colors)
         for index, color in enumerate(colors):
             self.axes.add_patch(

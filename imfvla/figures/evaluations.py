@@ -1,4 +1,4 @@
-"""Success against the number of network evaluations: a panel for each method on each task, a line for each change."""
+"""Success against the number of network calls (NFE): a panel for each method on each task, a line for each change."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -18,7 +18,7 @@ Line = list[Result]
 
 
 def success_by_evaluations(results: Sequence[Result]) -> Figure:
-    """Of policies evaluated with several numbers, with the weights at the end of training and Wilson intervals."""
+    """Policies evaluated at several NFE, with the weights at the end of training and Wilson intervals."""
     last = sorted((result for result in results if result.is_last), key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]

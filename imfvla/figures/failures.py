@@ -1,4 +1,4 @@
-"""Where episodes end: of those without success, the first stage that was not reached, a bar for each result."""
+"""Where episodes fail: for those without success, the first stage that was not reached, a bar for each result."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ def failed_stages(results: Sequence[Result]) -> Figure:
 
 
 def _sorted(results: Sequence[Result]) -> list[Result]:
-    """Results of a name side by side, names in their order, numbers of evaluations ascending."""
+    """Results of one name side by side, names in their order, NFE ascending."""
     names = list(dict.fromkeys(map(result_name, results)))
     return sorted(results, key=lambda result: (names.index(result_name(result)), result.nfe))
 

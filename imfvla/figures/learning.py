@@ -1,4 +1,4 @@
-"""Learning curves: the loss of every run against its steps. Losses of one kind share a panel, others do not."""
+"""Learning curves: the loss of every run against its steps. Only losses of one kind share a panel."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -88,20 +88,20 @@ def _curves(results: Sequence[Result]) -> dict[str, Curves]:
 
 
 def _kind(evaluation: Evaluation) -> dict[str, Any]:
-    """The generator, and what of it the numbers of the loss hang on."""
+    """The generator, and those of its options that the unit of the loss depends on."""
     generator = evaluation.config.get("generator", {})
     units = {key: generator[key] for key in UNITS if key in generator}
     return {"class": _class(generator), **units}
 
 
 def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The name of each generator, with what tells it from others of its class."""
+    """The name of each generator, with what distinguishes it from others of its class."""
     titles = []
     for kind in kinds:
         rivals = [other for other in kinds if other["class"] == kind["class"] and other != kind]
-        told = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
-        value = kind.get(told)
-        detail = OUTPUTS.get(str(value), f"{told} {_class(value) if isinstance(value, dict) else value}")
+        unit = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
+        value = kind.get(unit)
+        detail = OUTPUTS.get(str(value), f"{unit} {_class(value) if isinstance(value, dict) else value}")
         name = GENERATOR.get(kind["class"], kind["class"] or "training loss")
         titles.append(f"{name}, {detail}" if told else name)
     return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]

@@ -1,4 +1,4 @@
-"""How figures call what was trained: by the method of the tables' row, and by what was changed about it."""
+"""The names of trained policies in figures: the method of the tables' row, and what was changed in it."""
 
 import re
 from functools import cache
@@ -9,12 +9,12 @@ from imfvla.reporting.runs import Evaluation
 
 USUAL = "as in the tables"
 CHANGES = {"task.expert.modes=1": "unimodal demonstrations"}
-# of a row's setting, what is no part of a policy: the number of evaluations, and the paper's own steps of training
+# of a row's setting, what is no part of a policy: the NFE, and the paper's own steps of training
 NOT_TRAINED = re.compile(r"infer\d+|\d+k|step\d+")
 
 
 def training_of(evaluation: Evaluation) -> tuple[str, list[str]]:
-    """Method of a policy and what was changed about it, such as ("L1 regression", ["unimodal demonstrations"])."""
+    """Method of a policy and what was changed in it, such as ("L1 regression", ["unimodal demonstrations"])."""
     found = _nearest(evaluation.experiment, evaluation.key)
     if found is None:
         return evaluation.experiment, _split(evaluation.key)
@@ -58,7 +58,7 @@ def _nearest(experiment: str, key: str) -> TableRow | None:
 
 
 def _is_shared(row: TableRow) -> bool:
-    """Whether several trainings of a table go by the method's name."""
+    """Whether several trainings of a table share the method's name."""
     rows = [other for other in read_mapping().of_table(row.table) if other.method == row.method]
     return len({(other.experiment, other.overrides) for other in rows}) > 1
 

@@ -17,7 +17,7 @@ FACES = {
     "generator": "#fbeaf3",
     "robot": "#f2f2f2",
 }
-MAX_BLOCKS, MAX_STEPS = 12, 20  # more of them than this are not drawn one by one
+MAX_BLOCKS, MAX_STEPS = 12, 20  # larger numbers are not drawn one by one
 
 
 def method_overview(config: Mapping[str, Any]) -> Figure:

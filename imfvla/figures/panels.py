@@ -13,7 +13,7 @@ LINES = ("-", "--", ":", "-.")
 
 
 def say_nothing_yet(axes: Axes, text: str) -> None:
-    """Where nothing is measured, an empty panel that says so."""
+    """An empty panel that says that nothing is measured."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=GREY)
 
 

@@ -20,16 +20,16 @@ LABEL_HEIGHTS = (-2, 7, -11, 15, -19, 23, -27)  # points above the middle of a m
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A policy with a number of evaluations: the lower and the further up, the better."""
+    """A policy at one NFE; a lower cost and a higher gain are better."""
 
     method: str
-    label: str  # number of network evaluations, "" where the paper does not say it
+    label: str  # NFE, "" where the paper does not give it
     latency_ms: float
     reward: Measured
 
 
 def reward_latency(results: Sequence[Result]) -> Figure:
-    """The printed values on the left, ours on the right: latencies of different machines share no axis."""
+    """The printed values on the left, ours on the right: latencies of different machines do not share an axis."""
     printed = [_printed(result.paper) for result in results]
     ours = [_ours(result) for result in results if not result.is_missing]
     methods = list(dict.fromkeys(point.method for point in (*printed, *ours) if point))
@@ -59,7 +59,7 @@ def reward_latency(results: Sequence[Result]) -> Figure:
 
 
 def pareto_frontier(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Of (cost, gain): those that none costs at most as much as and gains more than, by cost."""
+    """The points (cost, gain) for which no other has at most the cost and more gain, sorted by cost."""
     frontier: list[tuple[float, float]] = []
     for cost, gain in sorted(points, key=lambda point: (point[0], -point[1])):
         if not frontier or gain > frontier[-1][1]:
@@ -117,7 +117,7 @@ def errors(measured: Sequence[Measured]) -> np.ndarray:
 
 
 def _write_labels(axes: Axes, points: Sequence[Point], methods: Sequence[str]) -> None:
-    """Beside each point, at the first place where it hides no label or interval, or the fewest."""
+    """Beside each point, at the first place where it hides no label or interval, else where it hides fewest."""
     scale = 72 / axes.figure.dpi
     frame = axes.bbox.transformed(Affine2D().scale(scale))
     taken = [_extent(axes, point).transformed(Affine2D().scale(scale)) for point in points]

@@ -1,4 +1,4 @@
-"""How every figure looks, and how one becomes files that are equal for equal content."""
+"""The style of all figures, and how they are saved: equal content gives equal files."""
 
 import io
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ DPI = 160
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Figures made inside look as all of them do; settings of the process are left alone."""
+    """Figures made inside this context have the common style; global settings are left alone."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(STYLE)
@@ -56,7 +56,7 @@ def render(figure: Figure) -> dict[str, bytes]:
     content = {}
     with style():
         figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # places are found: the formats need not find them again
+    figure.set_layout_engine("none")  # the layout is computed: it need not be repeated for each format
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         stream = io.BytesIO()
         with style():

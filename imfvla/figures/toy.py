@@ -12,7 +12,7 @@ COLUMNS = 3
 
 
 def toy_figure(data: np.ndarray, cases: Sequence[tuple[str, str, bool, np.ndarray]]) -> Figure:
-    """Data (N, 2) and, of each case, a title, its figures, whether it passes and samples (N, 2)."""
+    """Data (N, 2) and, for each case, a title, its numbers, whether it passes and samples (N, 2)."""
     shown = [("data", f"{len(data)} samples", None, data), *cases]
     rows = -(-len(shown) // COLUMNS)
     with style():

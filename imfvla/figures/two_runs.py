@@ -1,4 +1,4 @@
-"""Two runs against each other: which starts each succeeded from, and differences with their intervals."""
+"""Two runs compared: which starts each succeeded from, and differences with their intervals."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ AXES = {
 
 
 def two_runs(duels: Sequence[Duel]) -> Figure:
-    """A line for each pair of evaluations; intervals are 95%, points filled where a difference is shown."""
+    """A line for each pair of evaluations; intervals are 95%, points are filled where a difference is significant."""
     with style():
         figure = new_figure(WIDTH, 1.9 + 0.5 * len(duels))
         outcomes, *differences = figure.subplots(1, 1 + len(AXES), sharey=True, width_ratios=[1.5, 1, 1, 1])

@@ -27,7 +27,7 @@ class Evaluated:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What stands in a row of the tables: an evaluation for each training seed, ascending; none where it is missing."""
+    """What fills a row of the tables: an evaluation for each training seed, ascending; none where it is missing."""
 
     row: TableRow
     evaluated: tuple[Evaluated, ...]
@@ -39,7 +39,7 @@ class Answer:
 
 
 class Sources:
-    """The runs below some directories. For a row, a later directory counts before an earlier one, alone."""
+    """The runs below some directories. A row is filled from the last directory that has an evaluation for it."""
 
     def __init__(self, directories: Sequence[Path]) -> None:
         runs = [find_runs([Path(directory)]) for directory in directories]
@@ -57,8 +57,8 @@ class Sources:
     def answer(self, row: TableRow, mapping: Mapping) -> Answer:
         """The evaluations of a row.
 
-        Raises UserError, naming the row, where runs contradict each other or were evaluated in another way than the
-        row wants, and naming file and line where episodes are damaged.
+        Raises UserError naming the row where runs contradict each other or were evaluated with another protocol than
+        the row's, and naming file and line where episodes are damaged.
         """
         others: list[Evaluation] = []
         for found in reversed(self.evaluations):
@@ -72,8 +72,8 @@ class Sources:
         command = self.command(row, mapping)
         if others:
             raise UserError(
-                f"{row.where} ({row.name}) wants another protocol than {others[0].folder} has, where "
-                f"{_as_wanted(others[0], row.wanted)}: {command}"
+                f"{row.where} ({row.name}) needs another protocol than that of {others[0].folder}, where "
+                f"{_as_wanted(others[0], row.wanted)}. Run: {command}"
             )
         return Answer(row, (), command)
 
@@ -94,9 +94,9 @@ class Sources:
         return train if row.checkpoint == LAST else f"{train} && {_evaluate(row, Path(directory))}"
 
     def others(self, answers: Sequence[Answer]) -> list[list[Evaluated]]:
-        """Evaluations of the reporting band that stand in no row; those of all training seeds together.
+        """Evaluations of the reporting band that fill no row; those of all training seeds together.
 
-        Of a policy's several the last directory's.
+        Where several directories have a policy, the last one counts.
         """
         taken = {found.evaluation.folder for answer in answers for found in answer.evaluated}
         answered = {_identity(found.evaluation) for answer in answers for found in answer.evaluated}
@@ -113,7 +113,7 @@ class Sources:
 
 
 def check_equal_protocols(answers: Sequence[Answer]) -> None:
-    """Raises UserError where rows of one table were not evaluated in the same way."""
+    """Raises UserError where rows of one table were evaluated with different protocols."""
     every = [(answer.row, found) for answer in answers for found in answer.evaluated]
     for (row, one), (other_row, other) in pairwise(every):
         ours, theirs = one.evaluation.summary["protocol"], other.evaluation.summary["protocol"]
@@ -122,12 +122,12 @@ def check_equal_protocols(answers: Sequence[Answer]) -> None:
                 raise UserError(
                     f"Table {row.table} mixes protocols: {key} is {ours.get(key)!r} in {one.evaluation.folder} "
                     f"({row.where}) and {theirs.get(key)!r} in {other.evaluation.folder} ({other_row.where}); "
-                    "evaluate both in the same way."
+                    "evaluate both with the same protocol."
                 )
 
 
 def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
-    """Whether it is of the row's policy, weights and number of evaluations, with noise as in training."""
+    """Whether it is of the row's policy, weights and NFE, with noise as in training."""
     policy = (evaluation.experiment, evaluation.key, evaluation.nfe)
     if policy != (row.experiment, row.run, row.nfe) or not evaluation.is_usual:
         return False
@@ -135,7 +135,7 @@ def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
 
 
 def _as_wanted(evaluation: Evaluation, wanted: Wanted) -> str | None:
-    """What differs from the wanted evaluation, None where nothing does."""
+    """What differs from the wanted evaluation; None if nothing does."""
     protocol = evaluation.summary["protocol"]
     for key in Wanted.__slots__:
         if protocol.get(key) != getattr(wanted, key):
@@ -144,12 +144,12 @@ def _as_wanted(evaluation: Evaluation, wanted: Wanted) -> str | None:
 
 
 def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
-    """Several evaluations may stand in a row if they are of policies that differ in nothing but the training seed."""
+    """Several evaluations may fill a row if their policies differ only in the training seed."""
     for one, other in pairwise(found):
         if one.training_seed == other.training_seed:
             raise UserError(
                 f"{row.where} ({row.name}) is answered twice, by {one.folder} and {other.folder}: move one "
-                "elsewhere, or name directories=[...] that hold one of them."
+                "elsewhere, or set directories=[...] to directories that hold only one of them."
             )
         differing = differences(one.config, other.config, ("seed", *EXECUTION_KEYS))
         if differing:
@@ -166,10 +166,10 @@ def read_evaluated(evaluation: Evaluation) -> Evaluated:
     for key, value in summarise(episodes).items():
         if key not in evaluation.summary:
             continue  # a metric that was added after the evaluation was made
-        told = evaluation.summary[key]
-        if not _equal(told, value):
+        stated = evaluation.summary[key]
+        if not _equal(stated, value):
             raise UserError(
-                f"{path} gives {key} = {value!r}, summary.json beside it says {told!r}: one was changed; {REMEDY}."
+                f"{path} gives {key} = {value!r}, but its summary.json says {stated!r}: one was changed; {REMEDY}."
             )
     return Evaluated(evaluation, episodes)
 

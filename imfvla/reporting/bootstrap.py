@@ -14,7 +14,7 @@ from scipy import stats
 from imfvla.reporting.measured import Measured
 
 RESAMPLES = 10_000
-RESAMPLES_OF_PARTS = 2_000  # where only a variance is wanted, for the degrees of freedom
+RESAMPLES_OF_PARTS = 2_000  # where only a variance is needed, for the degrees of freedom
 TAILS = (0.025, 0.975)
 NUMBERS_AT_ONCE = 2_000_000  # bounds what a hierarchical bootstrap needs to some arrays of 16 MB
 
@@ -62,7 +62,9 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
     columns = [column for columns in policies for column in columns]
     lengths = {column.shape[1] for column in columns}
     if len(lengths) != 1 or not all(column.size for column in columns):
-        raise ValueError(f"Wanted columns of the same starts, found {[column.shape for column in columns]}.")
+        raise ValueError(
+            f"The columns must have the same starts, found {[column.shape for column in columns]}."
+        )
     with np.errstate(all="ignore"):
         value = float(statistic(*(column.ravel() for column in columns), axis=-1))
         if lengths == {1} or not np.isfinite(value):
@@ -76,7 +78,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
 
 def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: float) -> Bootstrapped:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # scipy's, of what is handled below
+        warnings.simplefilter("ignore")  # of scipy, about cases that are handled below
         found = stats.bootstrap(
             columns, statistic, paired=True, n_resamples=RESAMPLES, confidence_level=TAILS[1] - TAILS[0],
             method="BCa", rng=np.random.default_rng(0),

@@ -1,4 +1,4 @@
-"""Two rows compared in pairs, as Table 3 does: what it comes to, or why the pairing is refused."""
+"""Two rows compared in pairs, as in Table 3: the result, or why the pairing is refused."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ CONTRASTS = {  # metric and operation -> function, and whether it takes row and 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A row of Table 3. `result` is None where a row is missing or `refused` says why it cannot be had.
+    """A row of Table 3. `result` is None where a row is missing, or where `refused` says why there is none.
 
     `detectable` is the smallest result in favour of the row that so many pairs would have shown (see `Contrast`).
     """
@@ -66,7 +66,7 @@ def _compare(comparison: Comparison, row: Result, baseline: Result) -> Compared:
     if compared.is_missing:
         return compared
     if (comparison.of, comparison.operation) not in CONTRASTS:
-        reason = f"{comparison.operation} of {comparison.of} is not offered: take a ratio"
+        reason = f"{comparison.operation} of {comparison.of} is not offered: use a ratio"
         return replace(compared, refused=reason)
     reason = refusal(row.evaluated, baseline.evaluated, times=comparison.of in TIMES)
     if reason:

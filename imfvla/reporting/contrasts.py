@@ -1,4 +1,4 @@
-"""Two policies compared start by start: differences and ratios, how certain they are, what would have been found."""
+"""Two policies compared start by start: differences and ratios, their intervals, and the smallest that would show."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ MCNEMAR, SIGN_FLIP, SEEDS = "exact McNemar", "sign flip", "sign flip, and t over
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """A difference or a ratio of two policies; 0 or 1 where they are alike, more in our favour.
+    """A difference or a ratio of two policies: 0 or 1 where they are alike, more where ours is better.
 
     `p` is two-sided, by `test`. `detectable` is the smallest `result` in our favour that so many pairs would have shown
     with probability 0.8 (`power`); None where there is none.

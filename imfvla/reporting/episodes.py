@@ -1,4 +1,4 @@
-"""The rows of `episodes.jsonl`, read as something that may be cut off or damaged."""
+"""Reads the rows of `episodes.jsonl`, which may be cut off or damaged."""
 
 import math
 from pathlib import Path
@@ -17,7 +17,7 @@ SHAPE = {
     "max_reward": (float, "a finite number"),
     "success": (bool, "true or false"),
     "first_step_of_stage": (list, "a list"),
-    "failure": (str | None, "a text or null"),
+    "failure": (str | None, "text or null"),
     TIMING: (dict, "a mapping"),
 }
 
@@ -25,7 +25,7 @@ SHAPE = {
 def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
     """The rows of `path`, one for each of `seeds`, in their order.
 
-    Raises UserError naming file and line where one is cut off, damaged, foreign or there twice, or where some lack.
+    Raises UserError naming file and line where a row is cut off, damaged, foreign, repeated or missing.
     """
     if not path.exists():
         raise UserError(f"{path} is missing beside its summary.json: {REMEDY}.")
@@ -35,16 +35,15 @@ def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
         row = read_row(line, where)
         if row["seed"] not in seeds:
             raise UserError(
-                f"{where} is of seed {row['seed']}, its summary.json of {seeds[0]} to {seeds[-1]}: {REMEDY}."
+                f"{where} is of seed {row['seed']}, but its summary.json covers {seeds[0]} to {seeds[-1]}: {REMEDY}."
             )
         if row["seed"] in rows:
-            raise UserError(f"{where} has the episode of seed {row['seed']} for the second time: {REMEDY}.")
+            raise UserError(f"{where} repeats the episode of seed {row['seed']}: {REMEDY}.")
         rows[row["seed"]] = row
     missing = [seed for seed in seeds if seed not in rows]
     if missing:
         raise UserError(
-            f"{path}, line {len(rows)} is the last one, where {len(seeds)} episodes were wanted: "
-            f"seed {missing[0]} is missing; {REMEDY}."
+            f"{path} has {len(rows)} of {len(seeds)} episodes: seed {missing[0]} is missing; {REMEDY}."
         )
     return tuple(rows[seed] for seed in seeds)
 

@@ -90,7 +90,7 @@ class Mapping:
         return tuple(row for row in self.rows if row.table == table)
 
     def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
-        """The first row of an experiment, a `run_key` and a number of evaluations, of whichever checkpoint."""
+        """The first row of an experiment, a `run_key` and an NFE, whatever its checkpoint."""
         wanted = (experiment, run, nfe)
         return next((row for row in self.rows if (row.experiment, row.run, row.nfe) == wanted), None)
 
@@ -117,14 +117,14 @@ class _ComparisonEntry:
 
 
 def run_key(directory: str) -> str:
-    """What the name of a run directory says beside the training seed: "" for "default", "seed=1" and the like."""
+    """What the name of a run directory says besides the training seed: "" for "default", "seed=1" and the like."""
     parts = [part for part in directory.split(",") if not re.fullmatch(r"seed=\d+|default", part)]
     return re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", ",".join(parts))
 
 
 @cache
 def read_mapping(path: Path = PATH) -> Mapping:
-    """The mapping of a file. Raises UserError naming file, line and row for whatever is not as it should be."""
+    """The mapping of a file. Raises UserError naming file, line and row for anything invalid."""
     content = _load(path)
     known = {"evaluation", *(f"table{number}" for number in (*TABLES, 3))}
     for key in content:
@@ -166,11 +166,11 @@ def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wa
     paper = None
     if read.paper is not None:
         if read.method is not None or read.setting is not None:
-            raise UserError(f"{where} has paper and method or setting: wanted one or the other.")
+            raise UserError(f"{where} has both paper and method or setting: give one or the other.")
         labels = {row.label: row for row in paper_rows() if row.table == table}
         paper = _named(read.paper, labels, f"{where}: unknown row of the paper's Table {table}")
     elif read.method is None or read.setting is None:
-        raise UserError(f"{where} lacks paper, or else method and setting, which say what the row is.")
+        raise UserError(f"{where} must have paper, or method and setting, to say what the row is.")
     return TableRow(
         name=read.name,
         table=table,

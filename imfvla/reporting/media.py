@@ -10,7 +10,7 @@ FOLDER = "media"
 
 
 class Media:
-    """Links from a page in `directory`; with `is_copied`, `copies` says what is to be copied beside it."""
+    """Links from a page in `directory`; with `is_copied`, `copies` says what must be copied beside it."""
 
     def __init__(self, directory: Path, *, is_copied: bool) -> None:
         self._directory, self._is_copied = directory, is_copied

@@ -1,4 +1,4 @@
-"""From episodes to the paper's nine metrics, with the interval that a count deserves."""
+"""From episodes to the paper's nine metrics, with the interval of the success count."""
 
 import math
 from collections import Counter
@@ -10,11 +10,11 @@ import numpy as np
 from imfvla.episode import EpisodeResult
 
 Row = Mapping[str, Any]  # one line of episodes.jsonl
-TIMING = "timing"  # key of a row under which everything is that differs between equal runs
+TIMING = "timing"  # key of a row that holds all that differs between equal runs
 
 
 def row_of(result: EpisodeResult) -> dict[str, Any]:
-    """The line of `episodes.jsonl`: plain values, times apart under the last key, inference times to 1 us."""
+    """The line of `episodes.jsonl`: plain values; times are under the last key, inference times rounded to 1 us."""
     return {
         "seed": result.seed,
         "start_digest": result.start_digest,
@@ -69,7 +69,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def success_of_goal(rows: Sequence[Row]) -> dict[str, list[int]]:
-    """By what was asked for, where one scene serves several tasks: [successes, episodes]."""
+    """[successes, episodes] by the task asked for, where one scene serves several tasks."""
     counts: dict[str, list[int]] = {}
     for row in rows:
         count = counts.setdefault(row["goal"], [0, 0])

@@ -1,4 +1,4 @@
-"""What stands below the tables about how sure they are."""
+"""The notes below the tables about their uncertainty."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
 
 
 def detectable_success(pairs: int) -> str:
-    """Which difference of successes so many episodes of two policies show."""
+    """The smallest difference of successes that so many episodes of two policies show."""
     share = detectable_share_difference(pairs)
     if share is None:
         return f"{pairs} pairs of episodes show no difference of two policies' successes at p = {ALPHA}, however large."
@@ -19,7 +19,7 @@ def detectable_success(pairs: int) -> str:
 
 
 def pairing(compared: Sequence[Compared]) -> tuple[str, ...]:
-    """How measured comparisons were made, and what they would have shown."""
+    """How measured comparisons were made, and the smallest result that they would have shown."""
     tests = ", ".join(dict.fromkeys(found.test for found in compared))
     each = "; ".join(f"{found.comparison.paper.label} {_detectable(found)}" for found in compared)
     return (

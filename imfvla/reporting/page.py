@@ -1,4 +1,4 @@
-"""One static page: tables that sort, figures, what rows differ in, and the runs and episodes behind each row."""
+"""One static page: sortable tables, figures, differences of rows, and the runs and episodes behind each row."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ class Picture:
 def page(
     tables: Sequence[Table], pictures: Sequence[Picture], results: Sequence[Result], media: Media
 ) -> str:
-    """The page, which needs no other files than those that `media` links to."""
+    """The page, which needs no files but those that `media` links to."""
     named = {result.name: result for result in results}
     sections = [
         *(

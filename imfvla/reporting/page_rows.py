@@ -1,4 +1,4 @@
-"""What the page has of single rows: their rollouts as videos, links to files, and the configs behind them."""
+"""The page's parts about single rows: rollouts as videos, links to files, and the configs behind them."""
 
 import json
 from collections.abc import Sequence

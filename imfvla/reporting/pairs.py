@@ -1,4 +1,4 @@
-"""Episodes of two policies from the same starts, or why they are none."""
+"""Episodes of two policies from the same starts, or why they cannot be paired."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,7 +8,7 @@ from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.metrics import Row
 
 SAME = ("task", "variant", "noise_seed", "max_steps")  # of two protocols whose episodes are pairs
-SAME_FOR_TIMES = ("threads", "workers")  # of two fingerprints, beside the machine
+SAME_FOR_TIMES = ("threads", "workers")  # of two fingerprints, besides the machine
 
 
 class Pairs:
@@ -30,7 +30,7 @@ class Pairs:
     def policies(
         self, ours: tuple[np.ndarray, ...], theirs: tuple[np.ndarray, ...]
     ) -> tuple[tuple[np.ndarray, ...], ...]:
-        """The columns as `bootstrap` wants them: of two policies, or of one where both have the same weights."""
+        """The columns as `bootstrap` takes them: of two policies, or of one where both have the same weights."""
         weights = [
             [found.evaluation.summary["protocol"].get("weights") for found in policy]
             for policy in (self._ours, self._theirs)
@@ -39,7 +39,7 @@ class Pairs:
 
 
 def refusal(ours: Sequence[Evaluated], theirs: Sequence[Evaluated], *, times: bool = False) -> str | None:
-    """Why two policies' episodes are no pairs, as a clause; None where they are.
+    """Why two policies' episodes cannot be paired, as a clause; None if they can.
 
     All evaluations must have met the same starts, by number and digest, with the same noise seed; with `times`, on
     machines with the same fingerprint, with as many threads and workers.

@@ -1,4 +1,4 @@
-"""The paper's printed tables, from `experiments/paper`. Which run answers a row is `mapping.py`'s."""
+"""The paper's printed tables, from `experiments/paper`. `mapping.py` says which run fills a row."""
 
 import csv
 from dataclasses import dataclass

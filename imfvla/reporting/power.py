@@ -8,7 +8,7 @@ POWER = 0.8
 
 
 def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float | None:
-    """Smallest difference of two success shares that the exact McNemar test finds, None where it finds none.
+    """Smallest difference of two success shares that the exact McNemar test finds; None if it finds none.
 
     Of n pairs, M ~ Binomial(n, psi) disagree, and of these Binomial(M, (1 + delta / psi) / 2) in favour of the better
     policy; the power is the probability that this number is significant given M. Solved for delta at a power of 0.8
@@ -17,7 +17,7 @@ def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float 
 
     Args:
       pairs: n, the episodes of each policy.
-      disagreement: psi; a difference of more than that comes with as much. 0.5 is the worst for policies whose
+      disagreement: psi; a larger difference implies as much disagreement. 0.5 is the worst for policies whose
         successes have nothing to do with each other.
     """
 
@@ -32,9 +32,8 @@ def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float 
 def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
     """Probability that the exact McNemar test is significant, for psi = `disagreement` and delta = `difference`."""
     number = np.arange(pairs + 1)  # of pairs that disagree
-    most = stats.binom.ppf(
-        ALPHA / 2, number, 0.5
-    )  # of the worse side, to be significant; one too many at times
+    # successes of the worse side up to which a result is significant; sometimes one too many, corrected below
+    most = stats.binom.ppf(ALPHA / 2, number, 0.5)
     most -= stats.binom.cdf(most, number, 0.5) > ALPHA / 2
     better = 0.5 + 0.5 * difference / disagreement if disagreement else 0.5
     significant = stats.binom.cdf(most, number, 1 - better) + stats.binom.cdf(most, number, better)

@@ -14,7 +14,7 @@ from imfvla.reporting.paper import PaperRow
 
 
 class Result:
-    """What is known of a policy with a number of evaluations: a row of the tables, or one that stands in none.
+    """The results of a policy at one NFE: of a row of the tables, or of a policy outside of them.
 
     Of several training seeds, the episodes of all count. Numbers are None where the row is missing.
     """
@@ -29,7 +29,7 @@ class Result:
 
     @property
     def row(self) -> TableRow | None:
-        """The row of the tables that it stands in."""
+        """Its row of the tables."""
         return self.answer.row if self.answer else None
 
     @property
@@ -65,7 +65,7 @@ class Result:
 
     @property
     def is_last(self) -> bool:
-        """Whether the weights are those of the end of the training."""
+        """Whether the weights are those at the end of training."""
         evaluations = [found.evaluation for found in self.evaluated]
         return all(e.summary["checkpoint_step"] == e.training_steps for e in evaluations) and bool(
             evaluations
@@ -94,7 +94,7 @@ class Result:
 
     @cached_property
     def paper_success_share(self) -> Measured:
-        """The share printed in the paper, with the interval that its count deserves."""
+        """The share printed in the paper, with the interval of its count."""
         if not self.paper:
             return Measured(None)
         count, number = self.paper.success, self.paper.episodes

@@ -1,4 +1,4 @@
-"""What run directories have to tell: the evaluations of a run, one for each number of flow evaluations."""
+"""Reads run directories: the evaluations of a run, one for each NFE."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +11,9 @@ from imfvla.protocol import USUAL_NOISE, as_recorded
 from imfvla.reporting.mapping import TableRow, read_mapping, run_key
 from imfvla.run_directory import RunDirectory, training_steps
 
-REPORTING_FIRST_SEED = 100_000  # seeds from here on are for tables; below are demonstrations and selection
+REPORTING_FIRST_SEED = (
+    100_000  # seeds from here on are for tables; lower ones for demonstrations and selection
+)
 REMEDY = ": evaluate again with overwrite=true"
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
@@ -51,12 +53,12 @@ class Evaluation:
 
     @property
     def key(self) -> str:
-        """The overrides in the name of the run directory, its training seed apart; "" for none."""
+        """The overrides in the name of the run directory, without its training seed; "" for none."""
         return key_of(self.run, self.experiment)
 
     @property
     def policy(self) -> str:
-        """What was trained, the seed apart."""
+        """What was trained, without the seed."""
         return f"{self.experiment}/{self.key}" if self.key else self.experiment
 
     @property
@@ -80,7 +82,7 @@ class Evaluation:
 
     @property
     def row(self) -> TableRow | None:
-        """The row of the tables with the same policy and nfe, of whichever checkpoint."""
+        """The row of the tables with the same policy and NFE, whatever the checkpoint."""
         return read_mapping().find(self.experiment, self.key, self.nfe) if self.is_usual else None
 
     @property
@@ -99,7 +101,7 @@ def key_of(run: Path, experiment: str) -> str:
 def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
     """All finished evaluations of a run, by folder name. Raises UserError for a broken summary.
 
-    `config` spares reading it again.
+    Pass `config` to avoid reading it again.
     """
     config = run.config() if config is None else config
     folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
@@ -107,7 +109,7 @@ def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list
 
 
 def rows(run: RunDirectory) -> list[Evaluation]:
-    """The evaluations that stand for a run by itself, one for each nfe, ascending.
+    """The evaluations that represent a run, one for each NFE, ascending.
 
     Of several: whole episodes of the reporting band before others, then the usual noise, then later weights, then more
     episodes.
@@ -150,6 +152,6 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
             raise UserError(f"{path}: {key} must be of type {kind.__name__}, found {summary[key]!r}{REMEDY}.")
     seeds = summary["seeds"]
     if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
-        raise UserError(f"{path}: seeds must be the first and the last one, found {seeds!r}{REMEDY}.")
+        raise UserError(f"{path}: seeds must be [first, last], found {seeds!r}{REMEDY}.")
     summary |= {"protocol": as_recorded(summary["protocol"])}
     return Evaluation(run.path, folder, summary, config)

@@ -10,7 +10,7 @@ FLIPS = 100_000
 
 
 def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Exact p-value of McNemar's test: pairs (n,) in which one alone succeeds are as often ours as theirs.
+    """Exact p-value of McNemar's test: pairs (n,) in which only one policy succeeds are as often ours as theirs.
 
     Conditional and binomial (Q. McNemar, Psychometrika 12, 1947); 1 where no pair differs.
     """
@@ -22,7 +22,7 @@ def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def sign_flip(differences: np.ndarray) -> float:
-    """p-value of the permutation test of paired differences (n,): were both alike, either sign would be as likely.
+    """p-value of the permutation test of paired differences (n,): were both alike, either sign would be equally likely.
 
     The statistic is the mean (R. Fisher, The Design of Experiments, 1935). Exact up to 16 pairs that differ, else from
     100,000 flips of a fixed generator, the observed one counted in, so that it is never 0.

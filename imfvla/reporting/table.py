@@ -1,4 +1,4 @@
-"""A table as text cells, written for people, for Markdown, LaTeX and spreadsheets."""
+"""A table of text cells, written to the terminal, as Markdown, LaTeX and CSV."""
 
 import csv
 import io
@@ -29,7 +29,7 @@ LATEX = {
 class Table:
     """Title, column names, rows of as many cells, and paragraphs below.
 
-    `keys` has for each row the names of what it is of, where any are given; `commands` fill what is missing, by name.
+    `keys` has, for each row, the names of its results, if any; `commands` fill what is missing, by name.
     """
 
     title: str
@@ -84,7 +84,7 @@ class Table:
         return grouped
 
     def is_numeric(self, name: str) -> bool:
-        """Whether all cells of a column are numbers, with or without interval, or say that there is none."""
+        """Whether all cells of a column are numbers, with or without interval, or placeholders for one."""
         index = self.columns.index(name)
         return all(re.fullmatch(NUMERIC, row[index]) for row in self.rows)
 
@@ -101,11 +101,11 @@ class Table:
         if self.commands:
             console.print(Text(f"\n{FILL}"))
         for command in self.by_command():
-            console.print(Text(command), soft_wrap=True)  # in one piece, to be copied
+            console.print(Text(command), soft_wrap=True)  # unbroken, so that it can be copied
 
 
 def number(value: float | None, digits: int) -> str:
-    """With so many digits after the point, a dash for None."""
+    """`value` with so many decimals; a dash for None."""
     return NOTHING if value is None else f"{value:.{digits}f}"
 
 

@@ -22,7 +22,7 @@ COLUMNS = (
 def print_row(run: RunDirectory, console: Console | None = None, *, only: Collection[str] = ()) -> None:
     """Prints the rows of a run, one for each nfe, and writes `table_row.md` and `table_row.json` beside its config.
 
-    With `only`, folder names in `rollouts/`, prints those evaluations; the files always hold the rows that stand for
+    With `only`, folder names in `rollouts/`, prints those evaluations; the files always hold the rows that represent
     the run. Raises UserError where the run has no finished evaluation.
     """
     found = rows(run)
@@ -50,11 +50,11 @@ def table_of(found: Sequence[Evaluation]) -> Table:
         note += " Not all rows are whole episodes of the reporting band."
     for evaluation in found:
         if paper_of(evaluation) and evaluation.row.checkpoint != LAST:
-            note += f" The paper's row of nfe {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
+            note += f" The paper's row at NFE {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
         for goal, (successes, episodes) in evaluation.summary.get("success_of_goal", {}).items():
-            note += f" Nfe {evaluation.nfe}, asked for {goal}: {successes}/{episodes}."
+            note += f" NFE {evaluation.nfe}, asked for {goal}: {successes}/{episodes}."
         for label, count in evaluation.summary["failures"].items():
-            note += f" Nfe {evaluation.nfe}: {count} ended as failed, {label}."
+            note += f" NFE {evaluation.nfe}: {count} failed with {label}."
     return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), (note,))
 
 

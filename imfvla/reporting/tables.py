@@ -58,7 +58,7 @@ INTERVALS = (
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A table as people read it, and the numbers in it as programs read them."""
+    """A table for people, and its numbers for programs."""
 
     shown: Table
     data: Table
@@ -84,8 +84,8 @@ def paper_table(number: int, results: Sequence[Result], notes: Sequence[str] = (
 
 
 def other_table(results: Sequence[Result]) -> Document:
-    """Evaluations of the reporting band that stand in no row of the tables."""
-    title = "Evaluations that stand in no row"
+    """Evaluations of the reporting band that are in no row of the tables."""
+    title = "Other evaluations"
     cells = tuple((result.policy, str(result.nfe), _weights(result), *ours(result)) for result in results)
     keys = tuple((result.name,) for result in results)
     notes = (INTERVALS,) if results else ("There are none.",)
@@ -112,7 +112,9 @@ def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) ->
     if measured:
         notes = (*notes, *pairing(measured))
     refused = tuple(
-        f"{found.comparison.paper.label}: refused, as {found.refused}." for found in compared if found.refused
+        f"{found.comparison.paper.label}: refused, because {found.refused}."
+        for found in compared
+        if found.refused
     )
     columns = ("Comparison", "Metric", "Paper", "Ours", "p", "p (Holm)")
     keys = tuple((found.row.name, found.baseline.name) for found in compared)
@@ -195,7 +197,7 @@ def _weights(result: Result) -> str:
 
 
 def _described(results: Sequence[Result]) -> str:
-    """The protocol that all rows of a table share, and the machines that their latencies are of."""
+    """The protocol that all rows of a table share, and the machines on which latencies were measured."""
     found = [evaluated.evaluation for result in results for evaluated in result.evaluated]
     protocol, seeds = found[0].summary["protocol"], found[0].seeds
     machines = list(dict.fromkeys(machine(evaluation.summary) for evaluation in found))
@@ -203,7 +205,7 @@ def _described(results: Sequence[Result]) -> str:
     text = f"Ours: {len(seeds)} episodes from seeds {seeds[0]} to {seeds[-1]}, {task}"
     if len(machines) == 1:
         return f"{text}; {machines[0]}."
-    return f"{text}. Latencies are of {len(machines)} machines and not comparable: {'; '.join(machines)}."
+    return f"{text}. Latencies are from {len(machines)} machines, so they are not comparable: {'; '.join(machines)}."
 
 
 def _data(results: Sequence[Result]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:

@@ -1,7 +1,7 @@
 """Columns of text as lines that fit a terminal, however narrow it is.
 
-Where a table does not fit as it is, rows with the same first cell become a group under it as a heading, and intervals
-go below their numbers. Where that does not fit either, each group is turned: a line for each column, rows side by side.
+Where a table is too wide, rows with the same first cell become a group under that cell as a heading, and intervals go
+below their numbers. If that is too wide too, each group is transposed: a line for each column, rows side by side.
 """
 
 import re
@@ -27,7 +27,7 @@ class Line:
 
 
 def fit(columns: Row, rows: Sequence[Row], numeric: Sequence[bool], width: int) -> list[Line]:
-    """The table in the first layout that `width` characters hold; `numeric` columns are aligned to the right.
+    """The table in the first layout that fits `width` characters; `numeric` columns are aligned to the right.
 
     Without rows there is nothing to lay out.
     """

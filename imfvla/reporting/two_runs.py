@@ -1,4 +1,4 @@
-"""Two runs against each other, start by start: what each number of evaluations comes to, in a sentence and a table."""
+"""Two runs compared start by start: a sentence and a table for each NFE."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ NAMES = ("A", "B")
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """What two policies are compared in: a column of the tables, and how a difference of it reads."""
+    """A measure in which two policies are compared: a column of the tables, and how a difference in it reads."""
 
     title: str
     column: str
@@ -47,7 +47,7 @@ MEASURES = (
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A measure of both; `contrast` is None where `refused` says why it cannot be had."""
+    """A measure of both; `contrast` is None where `refused` says why it cannot be computed."""
 
     measure: Measure
     contrast: Contrast | None
@@ -62,7 +62,7 @@ class Compared:
 
 @dataclass(frozen=True, slots=True)
 class Duel:
-    """One evaluation of A and one of B from the same starts, and what they are compared in."""
+    """One evaluation of A and one of B from the same starts, and the measures compared."""
 
     ours: Evaluated
     theirs: Evaluated
@@ -75,7 +75,7 @@ class Duel:
 
 
 def compare_runs(a: RunDirectory, b: RunDirectory, nfe: Sequence[int] | None = None) -> list[Duel]:
-    """A against B for each number of evaluations; p-values corrected over all that is compared.
+    """A against B for each NFE; p-values are corrected over all comparisons.
 
     Args:
       nfe: one number for both, or one of A and one of B; None for each number that both were evaluated with.
@@ -99,7 +99,7 @@ def verdict(duel: Duel) -> str:
 
 
 def table_of(duels: Sequence[Duel]) -> Table:
-    """Both and their difference, with p-values and what would have been found."""
+    """Both and their difference, with p-values and the smallest detectable difference."""
     cells = []
     for duel in duels:
         both = [dict(zip(COLUMNS[3:], ours(Result([e])), strict=True)) for e in (duel.ours, duel.theirs)]
@@ -115,7 +115,7 @@ def table_of(duels: Sequence[Duel]) -> Table:
 def _compare(one: Evaluated, other: Evaluated) -> Duel:
     reason = refusal([one], [other])
     if reason:
-        raise UserError(f"The episodes are no pairs: {reason}. Evaluate both in the same way.")
+        raise UserError(f"The episodes cannot be paired: {reason}. Evaluate both with the same protocol.")
     timed = refusal([one], [other], times=True)
     compared = []
     for measure in MEASURES:
@@ -127,7 +127,7 @@ def _compare(one: Evaluated, other: Evaluated) -> Duel:
 
 def _pairs(a: RunDirectory, b: RunDirectory, nfe: Sequence[int] | None) -> list[tuple[Evaluated, Evaluated]]:
     if a.path.resolve() == b.path.resolve():
-        raise UserError(f"{a.path} is given twice: wanted two runs.")
+        raise UserError(f"{a.path} is given twice: name two different runs.")
     known = [{evaluation.nfe: evaluation for evaluation in rows(run)} for run in (a, b)]
     numbers = [(number, number) for number in known[0] if number in known[1]]
     if nfe is not None:
@@ -135,11 +135,11 @@ def _pairs(a: RunDirectory, b: RunDirectory, nfe: Sequence[int] | None) -> list[
     for run, found, wanted in zip((a, b), known, zip(*numbers, strict=True), strict=False):
         for number in wanted:
             if number not in found:
-                raise UserError(f"{run.path} was not evaluated with nfe {number}, but with {_listed(found)}.")
+                raise UserError(f"{run.path} was evaluated with nfe {_listed(found)}, not with {number}.")
     if not numbers:
         raise UserError(
-            f"{a.path} was evaluated with nfe {_listed(known[0])} and {b.path} with {_listed(known[1])}: no number is "
-            "common; name one of each, such as nfe=[1,100]."
+            f"{a.path} was evaluated with nfe {_listed(known[0])} and {b.path} with {_listed(known[1])}: no NFE is "
+            "common to both; name one of each, such as nfe=[1,100]."
         )
     return [(read_evaluated(known[0][one]), read_evaluated(known[1][other])) for one, other in numbers]
 
@@ -174,7 +174,7 @@ def _amount(found: Compared) -> str:
 def _sentence(found: Compared) -> str:
     measure = found.measure
     if found.refused:
-        return f"{measure.title}: not compared, as {found.refused}."
+        return f"{measure.title}: not compared, because {found.refused}."
     result = found.contrast.result
     if result.value is None:
         return f"{measure.title}: not measured."
@@ -202,7 +202,7 @@ def _notes(duel: Duel) -> tuple[str, ...]:
     return (
         *described,
         f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A minus B, speed is "
-        "B's time over A's. p is two-sided, of one comparison by itself and as corrected by Holm over the whole table. "
+        "B's time over A's. p is two-sided, for one comparison alone and after Holm's correction over the whole table. "
         "Detectable: the smallest difference "
         f"in favour of A that so many pairs would have shown with probability {POWER} at p = {ALPHA}.",
     )

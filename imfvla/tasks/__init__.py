@@ -29,7 +29,7 @@ def load(
     image_size: tuple[int, int] = (96, 96),
     views: tuple[str, ...] = VIEWS,
 ) -> "BimanualEnvironment":
-    """Builds the task `name`: "socket", "transfer", or "combined", the things of both and one sentence an episode.
+    """Builds the task `name`: "socket", "transfer", or "combined": the objects of both and one sentence an episode.
 
     Args:
         seed: drawn from by `reset()` without a seed of its own.
@@ -44,7 +44,7 @@ def load(
         raise UserError(f"There is no task {name!r}; choose one of {', '.join(sorted(NAMES))}.")
     if variant not in VARIANTS:
         raise UserError(f"task.variant must be one of {', '.join(VARIANTS)}, found {variant!r}.")
-    # mujoco is imported here, after the backend is chosen and only by those who simulate.
+    # mujoco is imported here: after the backend is chosen, and only by code that simulates.
     from imfvla.tasks.bimanual import BimanualEnvironment
     from imfvla.tasks.combined import CombinedTask
     from imfvla.tasks.socket import SocketTask

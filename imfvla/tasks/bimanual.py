@@ -27,7 +27,7 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True, slots=True)
 class StartRange:
-    """Where a thing may lie at the start: x and y of its centre [m], yaw [rad]; each is drawn uniformly."""
+    """Where an object may lie at the start: x and y of its centre [m], yaw [rad]; each is drawn uniformly."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -67,7 +67,7 @@ class BimanualTask(composer.Task):
     """Two arms, one table and some props. Subclasses place the props and say which stage holds.
 
     Attributes for subclasses to set: `name`, `num_stages`, `ranges` (prop name -> StartRange). `goal` is the task whose
-    stages hold and whose sentence is said: the task itself, but in a scene that serves several.
+    stages count and whose instruction is given: the task itself, except in a scene that serves several tasks.
     """
 
     name: str
@@ -225,10 +225,11 @@ class BimanualEnvironment(composer.Environment):
             time_limit=(TIME_LIMIT_STEPS - 0.1) / CONTROL_HZ,  # a margin for the sum of 3500 time steps
             random_state=0,
             recompile_mjcf_every_episode=False,
-            raise_exception_on_physics_error=False,  # a world that flies apart ends the episode, early and warned of
+            # a simulation that diverges ends the episode early, with a warning
+            raise_exception_on_physics_error=False,
             strip_singleton_obs_buffer_dim=True,
         )
-        self._mjcf_never_compiled = False  # the constructor has compiled it; nothing is drawn into the model
+        self._mjcf_never_compiled = False  # the constructor has compiled it; episodes do not change the model
 
     @property
     def name(self) -> str:
@@ -240,7 +241,7 @@ class BimanualEnvironment(composer.Environment):
 
     @property
     def goal(self) -> str | None:
-        """The task that the present episode is about, where the scene serves several."""
+        """The task of the current episode, where the scene serves several."""
         return None if self.task.goal == self.name else self.task.goal
 
     @property
@@ -254,7 +255,7 @@ class BimanualEnvironment(composer.Environment):
 
     @property
     def instruction(self) -> str:
-        """The sentence of the present episode."""
+        """The instruction of the current episode."""
         return text_for(self.task.goal)[0]
 
     @property
@@ -262,7 +263,7 @@ class BimanualEnvironment(composer.Environment):
         return text_for(self.task.goal)[1]
 
     def reset(self, seed: int | None = None) -> dm_env.TimeStep:
-        """Starts an episode; `seed` alone draws its start state. Without one the construction seed's next is taken."""
+        """Starts an episode from the state that `seed` determines. Without one, draws a seed from the constructor's."""
         if seed is None:
             seed = int(self._seeds.randint(2**31))
         self._random_state = self.task.begin(seed)
@@ -272,12 +273,12 @@ class BimanualEnvironment(composer.Environment):
         return timestep
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies one action (16,) for 20 ms. UserError where it is not 16 finite numbers."""
+        """Applies one action (16,) for 20 ms. UserError unless it is 16 finite numbers."""
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
             raise UserError(
                 f"An action must be {ACTION_DIM} finite numbers ({', '.join(ACTION_NAMES[:2])}, ...), "
-                f"found shape {action.shape}: {action}; check what chose it."
+                f"found shape {action.shape}: {action}; check the policy or script that chose it."
             )
         return super().step(action)
 
@@ -298,7 +299,7 @@ class BimanualEnvironment(composer.Environment):
         return hashlib.sha256(self.task.root_entity.mjcf_model.to_xml_string().encode()).hexdigest()[:16]
 
     def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-        """Pictures uint8 (H, W, 3) of the named views, of the configured ones by default."""
+        """Pictures uint8 (H, W, 3) of the named views, by default of the configured ones."""
         return {view: self.render(view, *self.image_size) for view in (views or self.views)}
 
     def render(self, view: str, height: int, width: int) -> np.ndarray:

@@ -13,7 +13,8 @@ from imfvla.tasks.transfer import BAR_LENGTH, transfer_stage
 
 STAGES = {"socket": (5, insertion_stage), "transfer": (4, transfer_stage)}
 GOALS = tuple(STAGES)
-LANE_RANGES = {  # peg and bar lie behind one another, wide enough apart for a gripper; which is behind is drawn
+# peg and bar lie one behind the other, far enough apart for a gripper; which is behind is drawn
+LANE_RANGES = {
     "easy": ((0.16, 0.20), (0.09, 0.10), (-0.1, 0.1)),
     "default": ((0.08, 0.26), (0.065, 0.125), (-0.3, 0.3)),
     "hard": ((0.06, 0.28), (0.065, 0.15), (-0.35, 0.35)),
@@ -21,7 +22,7 @@ LANE_RANGES = {  # peg and bar lie behind one another, wide enough apart for a g
 
 
 class CombinedTask(BimanualTask):
-    """The stages of the task that the present episode is about. Peg and bar swap sides in half of the episodes."""
+    """The stages of the task of the current episode. Peg and bar swap sides in half of the episodes."""
 
     name = "combined"
 

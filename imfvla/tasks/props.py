@@ -1,4 +1,4 @@
-"""The things that are handled: a square bar and a square ring on a tab. Lengths in m, densities in kg / m^3."""
+"""The objects that are handled: a square bar and a square ring on a tab. Lengths in m, densities in kg / m^3."""
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -26,7 +26,7 @@ _SOLID = {
     "contype": OBJECT_BIT,
     "conaffinity": TABLE_BIT + OBJECT_BIT + sum(HAND_BITS.values()),
     "friction": [0.3, 0.01, 0.0005],  # in the hole; the larger friction of table or finger replaces it
-    "condim": 3,  # a finger asks for 4 and gets it
+    "condim": 3,  # 4 in contacts with a finger, which asks for 4
     "solref": [0.01, 1],
     "solimp": [0.95, 0.99, 0.001],
     "density": 900,
@@ -34,7 +34,7 @@ _SOLID = {
 
 
 class Prop(composer.Entity):
-    """A rigid thing whose frame lies at the centre of what the task aligns; `rest_height` is its z on the table."""
+    """A rigid object whose frame lies at the centre of what the task aligns; `rest_height` is its z on the table."""
 
     rest_height: float
 
@@ -56,7 +56,7 @@ class Prop(composer.Entity):
 
 
 class Bar(Prop):
-    """A square bar along x. Both ends carry the same cap, so that half a turn changes nothing one could see."""
+    """A square bar along x. Both ends carry the same cap, so that half a turn makes no visible difference."""
 
     def _build(self, name: str, length: float, color: Color = ORANGE, cap: float = 0.02) -> None:
         super()._build(name)

@@ -17,8 +17,8 @@ FINGER_TRAVEL = 0.045  # of each finger; the opening is twice that
 FINGER_LENGTH = 0.08
 FINGERTIP = 0.006  # how far the fingers reach beyond the grip point
 JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
-# Motors are heavy for their damping on purpose: the contact solver knows inertia but not damping, and where damping
-# times the time step exceeds the inertia its forces are wrong, so that held things jump.
+# Motors have a large armature for their damping on purpose: the contact solver knows inertia but not damping. Where
+# damping times the time step exceeds the inertia, its forces are wrong and held objects jump.
 STIFFNESS = (2500.0, 2500.0, 1500.0, 1500.0, 400.0, 400.0, 200.0)  # [N m / rad]
 ARMATURE = (1.0, 1.0, 0.7, 0.7, 0.2, 0.2, 0.15)  # [kg m^2]
 LAG_S = 0.04  # damping over stiffness: joints follow their targets nearly like a first-order filter
@@ -158,7 +158,7 @@ class Arm(composer.Entity):
         """Two fingers on slides, coupled to move as mirror images, one actuator for the opening in [0, 1].
 
         A finger is a pair of capsules: against a box's face each makes two steady contacts, where two boxes' contacts
-        come and go by the step while their faces are nearly parallel, and let things drop.
+        come and go from step to step while their faces are nearly parallel, and objects fall.
         """
         solid = {
             "contype": HAND_BITS[self.side],

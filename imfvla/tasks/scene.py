@@ -8,12 +8,8 @@ from imfvla.views import LARGEST
 
 PHYSICS_TIMESTEP_S = 0.004
 BASE_X = 0.62  # the arms' bases stand at -x (left) and +x (right) and face each other
-CAMERAS = {
-    "front": "front",
-    "top": "top",
-    "r_wrist": "right/wrist",
-    "l_wrist": "left/wrist",
-}  # view -> MJCF name
+# view -> MJCF name
+CAMERAS = {"front": "front", "top": "top", "r_wrist": "right/wrist", "l_wrist": "left/wrist"}
 
 
 class Scene(composer.Arena):
@@ -34,7 +30,8 @@ class Scene(composer.Arena):
         root.worldbody.add(
             "geom",
             name="table",
-            type="plane",  # its third size is the spacing of the grid it is drawn with: fine grids cost milliseconds
+            # the third size is the spacing of the grid that is drawn: fine grids cost milliseconds
+            type="plane",
             size=[3, 3, 1],
             rgba=[0.80, 0.77, 0.70, 1],
             contype=TABLE_BIT,
@@ -62,7 +59,7 @@ class Scene(composer.Arena):
             frame.quat = [1, 0, 0, 0] if side == "left" else [0, 0, 0, 1]
 
     def _draw_plainly(self, root: mjcf.RootElement) -> None:
-        """No shadows, reflections or multisampling, coarse round shapes: frames come some 20 times faster."""
+        """No shadows, reflections or multisampling, coarse round shapes: rendering is some 20 times faster."""
         root.visual.quality.shadowsize = 0
         root.visual.quality.offsamples = 0
         root.visual.quality.numslices = 12

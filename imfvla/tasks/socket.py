@@ -25,18 +25,15 @@ RANGES = {  # the socket's frame is its mouth, some 5 cm towards the middle of t
     ),
 }
 LIFTED = 0.03  # above the resting height
-AT_MOUTH, AT_MOUTH_ASIDE, AT_MOUTH_ANGLE = (
-    0.03,
-    0.015,
-    0.25,
-)  # stage 3: distance along and aside the axis, tilt [rad]
+# stage 3: distance along the axis and off it, tilt [rad]
+AT_MOUTH, AT_MOUTH_ASIDE, AT_MOUTH_ANGLE = 0.03, 0.015, 0.25
 INSIDE, INSIDE_ANGLE = 0.005, 0.12  # stage 4
 SEATED = RING_THICKNESS - 0.002  # stage 5: depth at which the tip is through the ring
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How the peg lies to the socket: depth of its tip along the hole [m], that tip's offset (2,) [m], tilt [rad]."""
+    """The peg relative to the socket: depth of its tip along the hole [m], offset of the tip (2,) [m], tilt [rad]."""
 
     depth: float
     aside: np.ndarray
@@ -44,7 +41,7 @@ class Fit:
 
 
 class SocketTask(BimanualTask):
-    """Stages: 1 each arm holds its thing, 2 both lifted, 3 tip at the mouth, 4 tip inside and aligned, 5 seated."""
+    """Stages: 1 each arm holds its object, 2 both lifted, 3 tip at the mouth, 4 tip inside and aligned, 5 seated."""
 
     name = "socket"
     num_stages = 5
@@ -60,7 +57,7 @@ class SocketTask(BimanualTask):
 
 
 def insertion_stage(task: BimanualTask, physics: mjcf.Physics) -> int:
-    """How far the things "socket" and "peg" of a task are: 0 ... 5."""
+    """The stage, 0 to 5, of the objects "socket" and "peg" of a task."""
     contacts = task.contacts(physics)
     if not (task.holds(contacts, "left", "socket") and task.holds(contacts, "right", "peg")):
         return 0

@@ -1,4 +1,4 @@
-"""What each task is asked for in words: one canonical sentence and its paraphrases."""
+"""The instructions of each task: one canonical sentence and its paraphrases."""
 
 from imfvla.errors import UserError
 

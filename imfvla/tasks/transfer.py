@@ -29,7 +29,7 @@ class TransferTask(BimanualTask):
 
 
 def transfer_stage(task: BimanualTask, physics: mjcf.Physics) -> int:
-    """How far the thing "bar" of a task is: 0 ... 4."""
+    """The stage, 0 to 4, of the object "bar" of a task."""
     contacts = task.contacts(physics)
     left, right = (task.holds(contacts, side, "bar") for side in ("left", "right"))
     height = task.prop_pose(physics, "bar").position[2] - task.props["bar"].rest_height

@@ -94,9 +94,8 @@ def test_fresh_attention_residuals_equal_the_standard_pre_norm_network(residual,
     nn.init.zeros_(attnres.residual.query)
     for module in (*attnres.modules(), *standard.modules()):
         if isinstance(module, nn.LayerNorm):
-            module.eps = (
-                0.0  # what the pre-norm reads differs by a factor, which only a norm without it forgets
-            )
+            # the input of the pre-norm differs by a factor, which only a norm without epsilon removes
+            module.eps = 0.0
     x, t, r, context = inputs()
     torch.testing.assert_close(
         attnres(x, t, r, attnres.condition(context)),

@@ -109,7 +109,7 @@ def test_an_evaluation_of_another_protocol_is_refused_with_the_command_for_the_r
 ):
     answer_row(tmp_path, ROWS["socket_infer2"], **change)
     with pytest.raises(
-        UserError, match=rf"row 4 \(socket_infer2\) wants another.*{message}: python -m imfvla\."
+        UserError, match=rf"row 4 \(socket_infer2\) needs another.*{message}\. Run: python -m imfvla\."
     ):
         answer("socket_infer2", tmp_path)
     (tmp_path / "good").mkdir()
@@ -135,7 +135,7 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
     text = summary.read_text()
     summary.write_text(json.dumps(json.loads(text) | {"success_episodes": 100}))
     with pytest.raises(
-        UserError, match=r"episodes\.jsonl gives success_episodes = \d+, summary\.json .* says 100"
+        UserError, match=r"episodes\.jsonl gives success_episodes = \d+, its summary\.json says 100"
     ):
         answer("socket_infer2", tmp_path)
     summary.write_text(text)

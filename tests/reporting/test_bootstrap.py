@@ -16,9 +16,8 @@ def log_ratio(a, b, axis=-1):
 
 def test_a_skewed_mean_against_r(monkeypatch):
     monkeypatch.setattr(module, "RESAMPLES", 200_000)
-    found = bootstrap(
-        np.mean, SKEWED
-    )  # R's boot, as scipy's tests have it: boot.ci(boot(x, mean, 1e6), type = "bca")
+    # R's boot, from scipy's tests: boot.ci(boot(x, mean, 1e6), type = "bca")
+    found = bootstrap(np.mean, SKEWED)
     assert (found.low, found.high) == pytest.approx((32.31, 91.43), rel=0.005)
     assert found.error == pytest.approx(SKEWED.std() / 4, rel=0.02)
 
@@ -76,7 +75,7 @@ def test_a_ratio_to_hardly_anything_has_no_upper_end():
 
 
 def test_columns_of_different_starts_are_refused():
-    with pytest.raises(ValueError, match="of the same starts"):
+    with pytest.raises(ValueError, match="have the same starts"):
         bootstrap(np.mean, np.zeros(3), np.zeros(4))
 
 

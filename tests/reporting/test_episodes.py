@@ -48,10 +48,10 @@ def changed(number: int, **values) -> str:
         (changed(3, success=1), "line 3: success must be true or false, found 1"),
         (changed(3, first_step_of_stage=[1.5]), "line 3: first_step_of_stage must hold whole numbers"),
         (changed(3, timing={"wall_s": 1.0}), "line 3: timing must have wall_s and a list inference_ms"),
-        (changed(2, seed=7), "line 2 is of seed 7, its summary.json of 100000 to 100003"),
-        (changed(2, seed=100_000), "line 2 has the episode of seed 100000 for the second time"),
-        ("".join(TEXT.splitlines(keepends=True)[:3]), "line 3 is the last one, where 4 episodes were wanted"),
-        ("", "line 0 is the last one, where 4 episodes were wanted"),
+        (changed(2, seed=7), "line 2 is of seed 7, but its summary.json covers 100000 to 100003"),
+        (changed(2, seed=100_000), "line 2 repeats the episode of seed 100000"),
+        ("".join(TEXT.splitlines(keepends=True)[:3]), "has 3 of 4 episodes: seed 100003 is missing"),
+        ("", "has 0 of 4 episodes: seed 100000 is missing"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_line(path, text, message):

@@ -58,12 +58,9 @@ def test_a_share_of_training_seeds_is_as_sure_as_they_agree():
     assert (everywhere.low, everywhere.high) == pytest.approx(wilson_interval(100, 100))
 
 
+# M. Fagerland et al., Statistical Analysis of Contingency Tables (2017), chapter 8
 @pytest.mark.parametrize(
-    (
-        "table",
-        "low",
-        "high",
-    ),  # M. Fagerland et al., Statistical Analysis of Contingency Tables (2017), chapter 8
+    ("table", "low", "high"),
     [((1, 1, 7, 12), -0.507, -0.026), ((59, 6, 16, 80), -0.1186, -0.0046)],
 )
 def test_a_paired_difference_of_shares_against_published_values(table, low, high):

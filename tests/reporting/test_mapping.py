@@ -57,7 +57,7 @@ def test_the_training_seed_is_no_part_of_what_a_directory_says():
         ("name: socket_act", "name: socket_infer1", r"row 6: the name socket_infer1 is taken by .*row 1"),
         ("as: ratio }", "as: quotient }", r"table3, row 1: as must be ratio or"),
         ("of: avg_return", "of: reward", r"table3, row 1: of must be avg_return or"),
-        ("paper: \"ACT (action chunking)\"", "method: ACT", r"row 6 lacks paper, or else method and setting"),
+        ("paper: \"ACT (action chunking)\"", "method: ACT", r"row 6 must have paper, or method and setting"),
         ("paper: \"ACT (action chunking)\"", "method: ACT, setting: chunks", r"paper's row 'ACT .*' once, found 0"),
         ("evaluation: {", "evaluations: {", r"Unknown key evaluations \(did you mean evaluation\?\)"),
         ("table1:", "table1: []\ntable1:", r"line \d+ has table1 twice"),

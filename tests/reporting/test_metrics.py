@@ -59,13 +59,9 @@ def test_times_are_the_only_difference_of_equal_episodes():
     assert list(first)[-1] == "timing"
 
 
+# statsmodels.stats.proportion.proportion_confint(method="wilson")
 @pytest.mark.parametrize(
-    (
-        "successes",
-        "trials",
-        "low",
-        "high",
-    ),  # statsmodels.stats.proportion.proportion_confint(method="wilson")
+    ("successes", "trials", "low", "high"),
     [
         (0, 10, 0.0, 0.277533),
         (5, 100, 0.021543, 0.111752),

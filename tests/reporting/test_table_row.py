@@ -131,4 +131,4 @@ def test_episodes_that_ended_as_failed_are_told(run):
     path = next(run.glob("rollouts/*_nfe4_*/summary.json"))
     path.write_text(json.dumps(json.loads(path.read_text()) | {"failures": {"non-finite action": 2}}))
     print_row(RunDirectory(run), Console(quiet=True))
-    assert "Nfe 4: 2 ended as failed, non-finite action." in (run / "table_row.md").read_text()
+    assert "NFE 4: 2 failed with non-finite action." in (run / "table_row.md").read_text()

@@ -20,10 +20,8 @@ SPEED, TURN_SPEED = 0.125, 2.0  # m/s, rad/s
 GRASP_HEIGHT = 0.014  # of the point between the fingertips above the table
 HELD_OPENING = 0.33  # a gripper around a bar measures 0.27
 NOISE_CORRELATION = 0.9  # of the action noise from one control step to the next
-FREE_DISTANCE, LEAST_FREEDOM = (
-    0.08,
-    0.2,
-)  # full noise this far [m] from the goal, this share of it at the goal
+# full noise this far [m] from the goal, this share of it at the goal
+FREE_DISTANCE, LEAST_FREEDOM = 0.08, 0.2
 _STYLE_STREAM, _NOISE_STREAM = 11, 12
 _ARM = {"left": slice(0, 7), "right": slice(8, 15)}
 _GRIPPER = {"left": 7, "right": 15}
@@ -105,10 +103,10 @@ class Expert:
         self.task = task
         self.hands = {side: Hand(task, side, ArmKinematics(env.physics.model.ptr, side)) for side in SIDES}
         rng = np.random.default_rng(np.random.SeedSequence([seed, _STYLE_STREAM]))
-        signs = rng.choice(
-            [-1, 1], size=2
-        )  # always drawn, so that the rest of the style is the same in all modes
-        self.turn = {  # the hidden mode: which of its two equivalent yaws each gripper takes
+        # always drawn, so that the rest of the style is the same in all modes
+        signs = rng.choice([-1, 1], size=2)
+        # the hidden mode: which of its two equivalent yaws each gripper takes
+        self.turn = {
             "left": float(signs[0]) if self.modes == 4 else 1.0,
             "right": float(signs[1]) if self.modes >= 2 else 1.0,
         }

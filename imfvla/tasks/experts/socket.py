@@ -1,4 +1,4 @@
-"""Expert of the socket task: both arms pick and lift at once; the right one aligns the peg with what it measures."""
+"""Expert of the socket task: both arms pick and lift at once; the right one aligns the peg by feedback."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,8 @@ from imfvla.tasks.socket import PEG_LENGTH, SEATED, measure_fit
 
 STANDOFF = -0.045  # depth of the tip where the peg waits for the socket
 BEFORE_MOUTH = -0.012  # depth up to which the peg may come while it is not aligned
-GOAL_DEPTH = SEATED + 0.004  # beyond: the ring ends there, and pressing hard makes the peg slip from the hand
+# a little beyond: the ring ends there, and pressing hard pulls the peg out of the hand
+GOAL_DEPTH = SEATED + 0.004
 INSERTION_SPEED = 0.05  # m/s
 ALIGNED, ALIGNED_ANGLE = 0.0025, 0.04  # m, rad
 

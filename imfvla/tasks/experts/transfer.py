@@ -35,9 +35,8 @@ class TransferExpert(Expert):
     def command(self, env: BimanualEnvironment, contacts: np.ndarray) -> None:
         left, right = self.hands["left"], self.hands["right"]
         bar = self.task.prop_pose(env.physics, "bar")
-        if (
-            abs(rotation_vector(bar.rotation)[2]) > np.pi / 2
-        ):  # half a turn changes nothing about a symmetric bar
+        # half a turn changes nothing about a symmetric bar
+        if abs(rotation_vector(bar.rotation)[2]) > np.pi / 2:
             bar = Pose(bar.position, bar.rotation @ about_z(np.pi))
         meeting = Pose(self.meeting, np.eye(3))
         rest_height = self.task.props["bar"].rest_height
