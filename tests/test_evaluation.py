@@ -172,7 +172,7 @@ def test_a_wrong_nfe_is_named(value):
     ("arguments", "message"),
     [
         ([], "evaluate needs the directory of a training run: run="),
-        (["run={tmp}/nothing"], "is not a run directory: config.yaml is missing"),
+        (["run={tmp}/nothing"], "is not a run directory: it has no config.yaml"),
         (["run={run}", "nfe=1,0"], "nfe must be one or more whole numbers"),
         (["run={run}", "episodes=0"], "episodes must be between 1 and 1000000, found 0"),
         (["run={run}", "episodes=many"], "episodes must be a whole number, found 'many'"),
