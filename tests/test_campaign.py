@@ -93,7 +93,7 @@ def test_another_config_is_not_what_was_asked_for(policies):
 def test_a_failure_is_told_and_ends_no_other_policy(policies):
     (failure,) = Pretended(broken="ddpm_ph16").run(policies)
     assert "imfvla.train +exp=socket_ddpm_ph16" in failure
-    assert failure.endswith("ended with exit code 2; runs/campaign/socket_ddpm_ph16,default.log says why.")
+    assert failure.endswith("ended with exit code 2; see runs/campaign/socket_ddpm_ph16,default.log.")
     assert [policy.is_done for policy in policies] == [True, False, True]
 
 
@@ -120,7 +120,7 @@ def test_a_whole_name_means_that_policy_alone():
 
 
 def test_a_name_that_fits_nothing_is_told_with_those_there_are():
-    with pytest.raises(UserError, match=r"--only knitting fits none .*: socket_ph32_exec16/default, "):
+    with pytest.raises(UserError, match=r"--only knitting matches none .*: socket_ph32_exec16/default, "):
         TOOL.policies("campaign", "knitting")
 
 
