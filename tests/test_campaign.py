@@ -1,4 +1,4 @@
-"""The campaign: which policies it trains, that what is kept is not run again, and that a failure ends no other one."""
+"""The campaign: which policies it trains, that finished ones are not repeated, and that a failure stops no other."""
 
 import re
 import runpy

@@ -1,4 +1,4 @@
-"""tools/chaos.py in short: killed and stopped work comes back to the same result; what differs is told."""
+"""tools/chaos.py in short: killed and stopped work gives the same result when resumed; differences are reported."""
 
 import os
 import subprocess

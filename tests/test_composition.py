@@ -24,7 +24,7 @@ from imfvla.errors import UserError
         (["observation.views=[front"], r"Cannot read the override"),
     ],
 )
-def test_slips_get_one_sentence_with_the_names_that_exist(overrides, message):
+def test_typos_get_one_sentence_with_the_names_that_exist(overrides, message):
     with pytest.raises(UserError, match=message) as caught:
         compose("train", overrides)
     assert "\n" not in str(caught.value)

@@ -20,7 +20,7 @@ def command(config):
     if config["seed"] == 1:
         raise UserError("seed 1 is bad.")
     if config["seed"] == 2:
-        raise ZeroDivisionError("a slip of ours")
+        raise ZeroDivisionError("a bug of ours")
     if config["seed"] == 3:
         raise KeyboardInterrupt
     if config["seed"] == 7:
@@ -89,7 +89,7 @@ def test_our_own_mistakes_show_a_traceback(capfd):
     assert exit_.value.code == 1
     printed = capfd.readouterr().err
     assert "Traceback" in printed
-    assert "a slip of ours" in printed
+    assert "a bug of ours" in printed
 
 
 def test_unknown_override_makes_no_directory(tmp_path):
@@ -113,7 +113,7 @@ def test_leaves_the_environment_as_it_was():
     assert sys.argv == arguments
 
 
-def test_train_command_tells_a_slip_in_one_line(tmp_path):
+def test_the_train_command_reports_a_typo_in_one_line(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "imfvla.train", "+exp=nope"],
         capture_output=True,

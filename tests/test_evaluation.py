@@ -1,4 +1,4 @@
-"""Evaluations: equal seeds give equal bytes, a killed one goes on, a finished one is left alone."""
+"""Evaluations: equal seeds give equal bytes, a killed one resumes, a finished one is left alone."""
 
 import json
 import os
@@ -87,7 +87,7 @@ def test_workers_change_nothing(run):
     assert untimed_lines(run.rollouts(NAME)) == here
 
 
-def test_a_killed_evaluation_goes_on_where_it_stopped(run, monkeypatch):
+def test_a_killed_evaluation_resumes_where_it_stopped(run, monkeypatch):
     roll(run)
     uninterrupted = untimed_lines(run.rollouts(NAME))
     played: list[int] = []

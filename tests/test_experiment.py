@@ -65,7 +65,7 @@ def test_does_all_stages_once(calls, tmp_path):
     assert {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"} == files
 
 
-def test_goes_on_where_it_was_stopped(calls, tmp_path, monkeypatch):
+def test_resumes_where_it_was_stopped(calls, tmp_path, monkeypatch):
     config = compose("train", TINY)
     whole, stopped = RunDirectory(tmp_path / "whole"), RunDirectory(tmp_path / "stopped")
     run_experiment(config, whole)
@@ -191,7 +191,7 @@ def test_weights_of_another_method_are_refused(calls, tmp_path):
         load_policy(run)
 
 
-def test_a_number_of_evaluations_that_the_generator_has_not_is_told_before_anything_is_done(calls, tmp_path):
+def test_an_nfe_that_the_generator_does_not_support_is_refused_before_anything_is_done(calls, tmp_path):
     run = RunDirectory(tmp_path / "run")
     with pytest.raises(UserError, match="nfe"):
         run_experiment(compose("train", [*TINY, "generator=l1"]), run)

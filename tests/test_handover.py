@@ -1,4 +1,4 @@
-"""tools/handover.py: when the right hand lets go, by hand."""
+"""tools/handover.py: the delay until the right hand opens, against values computed by hand."""
 
 import numpy as np
 import pytest

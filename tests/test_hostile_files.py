@@ -77,7 +77,7 @@ def test_the_fuzzer_tells_another_error_and_a_reader_that_does_not_end(fuzz, tmp
 
     def read(path):
         if len(path.read_bytes()) > 2:
-            raise KeyError("a slip of ours")
+            raise KeyError("a bug of ours")
         while True:
             pass
 
@@ -85,7 +85,7 @@ def test_the_fuzzer_tells_another_error_and_a_reader_that_does_not_end(fuzz, tmp
     cut = fuzz.Target(tmp_path / "file", read, lambda data, rng: data[: rng.randrange(len(data) + 1)])
     failures = fuzz.fuzz(cut, 8, 0).failures
     assert len(failures) == 8
-    assert any("a slip of ours" in failure for failure in failures)
+    assert any("a bug of ours" in failure for failure in failures)
     assert any("TooSlow" in failure for failure in failures)
     assert (tmp_path / "file").read_bytes() == b"whole"
 

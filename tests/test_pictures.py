@@ -1,4 +1,4 @@
-"""tools/pictures.py: every picture of the documents is one that it makes, and what it lacks is told."""
+"""tools/pictures.py: every picture of the documents is one that it makes, and missing inputs are reported."""
 
 import subprocess
 import sys

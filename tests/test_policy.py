@@ -144,7 +144,7 @@ def test_a_policy_without_statistics_predicts_nothing_that_looks_valid():
     assert made.predict(data.obs, torch.zeros(3, 8, 16), 1).isnan().all()
 
 
-def test_no_evaluation_is_refused():
+def test_an_nfe_of_zero_is_refused():
     with pytest.raises(UserError, match="at least 1, found 0"):
         policy().predict(batch().obs, torch.zeros(3, 8, 16), 0)
 

@@ -1,4 +1,4 @@
-"""What a bar tells where nobody watches it, and bars inside of bars on a terminal."""
+"""The lines of a bar outside of a terminal, and nested bars on a terminal."""
 
 import io
 import logging

@@ -92,7 +92,7 @@ def test_equal_runs_give_equal_files(runs, tmp_path, method, unrendered):
 
 @pytest.mark.parametrize("name", [f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")])
 def test_tables_are_byte_for_byte_those_on_file(name, tables_of_synthetic_runs):
-    """python tests/test_publication.py writes them anew, for a look at what has changed."""
+    """python tests/test_publication.py rewrites them, so that git shows what has changed."""
     assert tables_of_synthetic_runs[Path("out", name)] == (EXPECTED / name).read_bytes()
 
 

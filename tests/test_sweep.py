@@ -1,4 +1,4 @@
-"""Sweeps: what their files ask for, that a killed one goes on, and that one failure ends no other job."""
+"""Sweeps: the jobs of their files, that a killed one resumes, and that one failure stops no other job."""
 
 import json
 from functools import cache
@@ -91,7 +91,7 @@ def jobs(synthetic_demonstrations) -> list[str]:
     return [*JOBS, f"demos.directory={synthetic_demonstrations}"]
 
 
-def test_a_sweep_killed_in_the_middle_goes_on_and_ends_as_an_undisturbed_one(jobs, tmp_path, monkeypatch):
+def test_a_sweep_killed_in_the_middle_resumes_and_ends_as_an_undisturbed_one(jobs, tmp_path, monkeypatch):
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     for directory in (undisturbed, killed):
         directory.mkdir()

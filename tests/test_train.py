@@ -1,4 +1,4 @@
-"""The main job at toy size, simulator included: collect, train, be stopped, go on, evaluate, print the row."""
+"""The main job at toy size, simulator included: collect, train, be stopped, resume, evaluate, print the row."""
 
 import json
 

@@ -95,7 +95,7 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
 
 
 def untimed_table(directory: Path) -> list[dict[str, str]]:
-    """Our rows, which stand in none of the paper's, without what was timed."""
+    """Our rows, which are in none of the paper's tables, without times."""
     from imfvla.reporting.answers import Sources
     from imfvla.reporting.results import Result
     from imfvla.reporting.tables import other_table

@@ -61,7 +61,7 @@ def test_a_sampler_resumes_only_its_own_run():
             other.load_state_dict(sampler.state_dict())
 
 
-def test_a_resumed_loader_goes_on_bit_for_bit(windows):
+def test_a_resumed_loader_continues_bit_for_bit(windows):
     with loader(windows, prefetch=1) as uninterrupted:
         expected = list(islice(uninterrupted, 9))
     with loader(windows, prefetch=4) as first:

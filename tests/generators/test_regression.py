@@ -36,7 +36,7 @@ def test_the_prediction_is_clamped():
     assert torch.equal(chunk, MEAN.clamp(-0.2, 0.2).expand_as(chunk))
 
 
-def test_more_than_one_evaluation_is_refused_in_one_sentence_that_names_both_sides():
+def test_more_than_one_step_is_refused_in_one_sentence_that_names_both_sides():
     with pytest.raises(
         UserError, match=r"^nfe, .*, must be 1 with generator=l1 \(one-step regression\), found 3\.$"
     ):

@@ -42,7 +42,7 @@ def test_check_names_the_broken_one(synthetic_demonstrations, capsys):
     assert "2 of 3 files ok" in out
 
 
-def test_check_goes_on_after_files_of_others(synthetic_demonstrations, capsys):
+def test_check_continues_after_files_of_others(synthetic_demonstrations, capsys):
     with (synthetic_demonstrations / "a.mcap").open("wb") as stream:
         writer = Writer(stream, use_statistics=False)
         writer.start()

@@ -22,7 +22,7 @@ def test_rows_are_means_since_the_last_row(tmp_path):
     ]
 
 
-def test_interval_goes_on_from_its_state(tmp_path):
+def test_interval_resumes_from_its_state(tmp_path):
     logger = MetricsLogger(RunDirectory(tmp_path / "a"), 0)
     logger.add({"loss": 0.1})
     state = json.loads(json.dumps(logger.state()))

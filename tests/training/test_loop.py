@@ -21,7 +21,7 @@ TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
 
 
 class Killed(BaseException):
-    """Stands for SIGKILL: nothing catches it."""
+    """Imitates SIGKILL: nothing catches it."""
 
 
 class DiesAt(TinyPolicy):
@@ -205,7 +205,7 @@ def test_too_many_skipped_batches_in_a_row_stop_the_run(tmp_path, make_trainer):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
-def test_a_request_to_stop_saves_the_step_and_goes_on_bit_for_bit(tmp_path, make_trainer, number):
+def test_a_request_to_stop_saves_the_step_and_resuming_is_bit_exact(tmp_path, make_trainer, number):
     class Asked(TinyPolicy):
         def loss(self, batch, rng):
             if trainer.step == 1:

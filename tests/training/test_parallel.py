@@ -15,7 +15,7 @@ from imfvla.training.parallel import Alone, Shared, WholeBatchDraws, rows
 from imfvla.types import Batch, Observation
 
 
-def test_two_processes_equal_one_and_one_goes_on_from_what_they_began(tmp_path, make_trainer):
+def test_two_processes_equal_one_and_one_resumes_what_they_began(tmp_path, make_trainer):
     make_trainer(tmp_path / "one", steps=6, log_every=1).train()
     jobs = [Job(str(tmp_path / "two")), Job(str(tmp_path / "mixed"), stops_before=2)]
     launch(jobs, tmp_path / "jobs.json")

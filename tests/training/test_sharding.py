@@ -58,7 +58,7 @@ def test_parts_compute_and_save_what_the_whole_does(runs):
     assert described[0].keys() == described[1].keys()
 
 
-def test_a_state_of_the_whole_goes_on_in_parts_and_back(runs):
+def test_a_state_of_the_whole_resumes_in_parts_and_back(runs):
     assert_close(runs / "begun", runs / "whole")
     assert train(Job(str(runs / "handed-over")), Alone()) == 3
     assert_close(runs / "handed-over", runs / "whole")

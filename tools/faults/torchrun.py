@@ -62,7 +62,7 @@ def undisturbed_pair(folder: Path) -> None:
 
 
 def killed_over(folder: Path, kills: int, rng: random.Random) -> list[str]:
-    """Kills at random moments until there have been `kills`, then waits for the end; returns which training each hit."""
+    """Kills at random moments until there have been `kills`, waits for the end, returns which training each hit."""
     log, during = folder / "killed.log", []
     command = processes.torchrun(jobs_in(folder / "killed"), folder / "jobs.json", restarts=kills)
     with started(command, log) as run:
