@@ -20,7 +20,7 @@ TO_BROWSER, FROM_BROWSER = 3, 4  # file descriptors that --remote-debugging-pipe
 
 
 class Page:
-    """One tab. `errors` has what its console and its scripts complained of so far."""
+    """One tab. `errors` has the messages of its console and its scripts so far."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from, self._numbers = to_browser, from_browser, itertools.count(1)
@@ -89,7 +89,7 @@ class Page:
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
-    """A browser with an empty tab; its profile lies in `profile`."""
+    """A browser with an empty tab; its profile is in `profile`."""
     browser_reads, to_browser = os.pipe()
     from_browser, browser_writes = os.pipe()
 

@@ -7,7 +7,7 @@ import pytest
 from absl.logging import get_absl_handler
 from synthetic import write_demonstrations
 
-# It would hold the stream that pytest captures, and close it where Hydra sets logging up.
+# It would hold the stream that pytest captures, and close it when Hydra sets up logging.
 get_absl_handler().python_handler.setStream(sys.__stderr__)
 
 

@@ -14,7 +14,7 @@ PARAPHRASES = ("insert the peg", "push the peg into the hole")
 
 
 class StillScene:
-    """Stands where an environment would: a red box, and frames where a square moves with `position`."""
+    """Takes the place of an environment: a red box, and frames where a square moves with `position`."""
 
     def __init__(self, views: tuple[str, ...], image_size: tuple[int, int]) -> None:
         self.views, self.image_size, self.position = views, image_size, 0.0

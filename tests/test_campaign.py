@@ -1,4 +1,4 @@
-"""The campaign: which policies it trains, that what is kept is not run again, and that a failure ends no other one."""
+"""The campaign: which policies it trains, that finished ones are not repeated, and that a failure stops no other."""
 
 import re
 import runpy
@@ -93,7 +93,7 @@ def test_another_config_is_not_what_was_asked_for(policies):
 def test_a_failure_is_reported_and_ends_no_other_policy(policies):
     (failure,) = Pretended(broken="ddpm_ph16").run(policies)
     assert "imfvla.train +exp=socket_ddpm_ph16" in failure
-    assert failure.endswith("ended with exit code 2; runs/campaign/socket_ddpm_ph16,default.log says why.")
+    assert failure.endswith("ended with exit code 2; see runs/campaign/socket_ddpm_ph16,default.log.")
     assert [policy.is_done for policy in policies] == [True, False, True]
 
 

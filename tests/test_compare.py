@@ -86,7 +86,7 @@ def test_a_difference_of_nothing_is_drawn(tmp_path):
     assert "not compared" not in texts(figure)
 
 
-def test_numbers_of_evaluations_may_differ(runs):
+def test_both_nfe_may_differ(runs):
     (duel,) = compare(*runs, nfe=[1, 2])
     assert duel.label == "infer1 against infer2"
 

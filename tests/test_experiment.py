@@ -167,7 +167,7 @@ def test_weights_to_evaluate_are_a_step_a_share_or_the_last(calls, tmp_path, che
 
 def test_failure_is_in_the_status(calls, tmp_path, monkeypatch):
     def fail(config):
-        raise UserError("no demonstrations to be had.")
+        raise UserError("no demonstrations were found.")
 
     monkeypatch.setattr(experiment, "ensure_demonstrations", fail)
     run = RunDirectory(tmp_path)
@@ -175,7 +175,7 @@ def test_failure_is_in_the_status(calls, tmp_path, monkeypatch):
         run_experiment(compose("train", TINY), run)
     status = run.status()
     assert status["state"] == FAILED
-    assert status["error"] == "no demonstrations to be had."
+    assert status["error"] == "no demonstrations were found."
     assert "Traceback" in status["traceback"]
 
 

@@ -1,14 +1,14 @@
-"""The campaign: trains and evaluates every policy of a sweep and keeps what came out in experiments/results.
+"""The campaign: trains and evaluates every policy of a sweep and keeps the results in experiments/results.
 
 python tools/campaign.py                        conf/sweep/campaign.yaml, one policy after the other
 python tools/campaign.py --side-by-side 2       two at a time, each with one thread and one worker
 python tools/campaign.py --list                 the commands, and which of them are done
-python tools/campaign.py --only transfer_dit    policies whose run directory is called so, or has this in its name
-python tools/campaign.py --commit               commits each result as soon as it is there
+python tools/campaign.py --only transfer_dit    policies whose run directory has this name, or a name with this in it
+python tools/campaign.py --commit               commits each result as soon as it is written
 
-A policy is done when experiments/results has every evaluation that the sweep asks for, made with the same config; so a
-campaign goes on where it was stopped, on another machine too, though what was half trained there begins anew. A policy
-that fails ends no other one. Ctrl-C lets those that train save their state. Weights stay in runs/.
+A policy is done when experiments/results has every evaluation that the sweep asks for, made with the same config. To
+resume a campaign, rerun the command; on another machine, policies that were half trained start over. A policy that
+fails does not stop the others. On Ctrl-C, running trainings save their state. Weights stay in runs/.
 """
 
 from imfvla.command import EXIT_FAILURE, as_command, begin
@@ -59,7 +59,7 @@ class Policy:
 
     @property
     def log(self) -> Path:
-        """What its training says, where others run beside it."""
+        """The log of its training, where several run side by side."""
         return LOGS / f"{self.name.replace('/', ',')}.log"
 
     @property
@@ -72,7 +72,7 @@ class Policy:
 
 
 def policies(sweep: str, only: str = "", results: Path = RESULTS) -> list[Policy]:
-    """Of conf/sweep/<sweep>.yaml the policy called `only`, else those whose names contain it. UserError for none."""
+    """The policy of conf/sweep/<sweep>.yaml called `only`, else those whose names contain it. UserError if none."""
     register_resolvers()
     jobs: dict[Path, list[Planned]] = {}
     for job in planned_jobs("train", [f"+sweep={sweep}"]):
@@ -83,12 +83,12 @@ def policies(sweep: str, only: str = "", results: Path = RESULTS) -> list[Policy
     ]
     if not chosen:
         names = ", ".join(policy.name for policy in found)
-        raise UserError(f"--only {only} fits none of the policies of {sweep}: {names}.")
+        raise UserError(f"--only {only} matches none of the policies of {sweep}: {names}.")
     return chosen
 
 
 class Campaign:
-    """Runs policies; knows the processes that it has started."""
+    """Runs policies and keeps track of the processes that it has started."""
 
     def __init__(self, side_by_side: int, commit: bool) -> None:
         self._side_by_side, self._commit = side_by_side, commit
@@ -97,7 +97,7 @@ class Campaign:
         self._is_stopped = False
 
     def run(self, waiting: Sequence[Policy], done: int = 0) -> list[str]:
-        """Runs what is not done yet and returns a sentence for each policy that failed."""
+        """Runs the policies that are not done yet and returns a sentence for each that failed."""
         failures: list[str] = []
         shown = self._side_by_side > 1  # a single training shows its own bars
         with (
@@ -122,7 +122,7 @@ class Campaign:
             code = self._train(policy, job.overrides)
             if code:
                 log = policy.log if self._side_by_side > 1 else policy.directory / "train.log"
-                return f"{command} ended with exit code {code}; {log} says why."
+                return f"{command} ended with exit code {code}; see {log}."
         try:
             made_by = keep(policy)
         except UserError as error:
@@ -178,7 +178,7 @@ def commit(policy: Policy, made_by: dict[str, object]) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--sweep", default="campaign", help="file of conf/sweep")
-    parser.add_argument("--only", default="", help="a run directory's name, or a part of several")
+    parser.add_argument("--only", default="", help="a run directory's name, or part of several names")
     parser.add_argument("--side-by-side", type=int, default=1, choices=range(1, 65), metavar="N")
     parser.add_argument("--commit", action="store_true", help="commit each result")
     parser.add_argument("--list", action="store_true", help="run nothing")

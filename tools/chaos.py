@@ -1,19 +1,19 @@
-"""Kills, stops and starves real processes of this project, lets them go on, and compares with an undisturbed run.
+"""Kills, stops and starves real processes of this project, resumes them, and compares with an undisturbed run.
 
 python tools/chaos.py                          # everything
 python tools/chaos.py training --kills 50      # one kind of work
 
-training, collection, evaluation   SIGKILL at random moments, every second one while a file is being written
+training, collection, evaluation   SIGKILL at random moments, every second time while a file is being written
 sweep                              the same over six trainings and evaluations of one command
-torchrun                           SIGKILL of one of two processes at random moments, a fifth as often; torchrun starts
-                                   both again. One training with the whole policy in each, one with a part in each
+torchrun                           SIGKILL of one of two processes at random moments, a fifth as often; torchrun
+                                   restarts both. One training with the whole policy in each, one with a part in each
 stops                              Ctrl-C, SIGTERM and SIGUSR1 in the middle of training: seconds to the end, exit code
-disk                               a full file system, a read-only one (both mounted, where that is allowed) and no
-                                   file handles left
+disk                               a full file system, a read-only one (both mounted, where permitted) and no file
+                                   handles left
 workers                            worker processes that die and hang in the middle of an evaluation
 
-Processes are forked after everything is imported, so that the signals fall into the work. The policy is the tiny one
-of the tests (in a sweep a small one that is composed), and its environment stands in for the simulator; loop,
+Processes are forked after everything is imported, so that the signals hit the work itself. The policy is the tiny one
+of the tests (in a sweep a small one that is composed), and its environment replaces the simulator; loop,
 checkpoints, recordings and logs are the real ones. Prints a line for each fault and exits with 1 where anything
 differs.
 """

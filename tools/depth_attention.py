@@ -1,4 +1,4 @@
-"""Plays one episode of a trained policy and writes what its Attention Residuals weigh, for the figures of make tables.
+"""Plays one episode of a trained policy and writes its Attention Residual weights, for the figures of make tables.
 
 python tools/depth_attention.py experiments/pretrained/socket_ph32_exec16
 
@@ -28,8 +28,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run")
     parser.add_argument("--checkpoint", default="last", help="training step of the weights, a share, or last")
-    parser.add_argument("--seed", type=int, default=SELECTION_FIRST_SEED, help="of the start state")
-    parser.add_argument("--nfe", type=int, default=1, help="evaluations of the network")
+    parser.add_argument("--seed", type=int, default=SELECTION_FIRST_SEED, help="seed of the start state")
+    parser.add_argument("--nfe", type=int, default=1, help="calls of the network for a chunk (NFE)")
     parser.add_argument("--max-steps", type=int, default=None, help="control steps, all of them by default")
     arguments = parser.parse_args()
     directory = RunDirectory(arguments.run)

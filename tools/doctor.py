@@ -4,10 +4,10 @@
     python tools/doctor.py                # everything; exit code 1 if a line fails
     python tools/doctor.py --only gl      # one check
 
-An environment variable with a value that nothing answers to ends it with one sentence and exit code 2.
+An environment variable with an invalid value ends it with one sentence and exit code 2.
 
-The frame is rendered in a process of its own with a time limit, so that a graphics driver that hangs cannot
-hang the doctor.
+The frame is rendered in a separate process with a time limit, so that a graphics driver that hangs cannot hang the
+doctor.
 """
 
 import sys
@@ -33,7 +33,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # works before the package is installed, and says then what is missing
+sys.path.insert(0, str(ROOT))  # works before the package is installed, and then says what is missing
 
 from imfvla import gl  # noqa: E402
 from imfvla.errors import UserError  # noqa: E402
@@ -89,7 +89,7 @@ def check_machine() -> Finding:
 
 
 def check_threads() -> Finding:
-    """How many threads torch would use; more than there are cores makes small matrices far slower."""
+    """How many threads torch would use; more threads than cores make small matrices far slower."""
     import torch
 
     from imfvla.fingerprint import physical_cores
@@ -156,19 +156,19 @@ def check_video() -> Finding:
     image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     encoded, png = cv2.imencode(".png", image)
     if not encoded or not (cv2.imdecode(png, cv2.IMREAD_COLOR) == image).all():
-        return Finding("video", "PNG is not read back as written", REINSTALL)
+        return Finding("video", "PNG pixels change when written and read back", REINSTALL)
     if "libx264" not in av.codecs_available:
         return Finding("video", "PyAV has no H.264 encoder (libx264)", REINSTALL)
-    return Finding("video", "PNG read back as written, H.264 encoder libx264")
+    return Finding("video", "PNG is lossless, H.264 encoder libx264")
 
 
 def check_disk(root: Path = ROOT) -> Finding:
-    """The checkout can be written to and there is room for demonstrations and runs."""
+    """The checkout is writable and there is room for demonstrations and runs."""
     try:
         with tempfile.NamedTemporaryFile(dir=root, prefix=".doctor-", suffix=".tmp"):
             pass
     except OSError as error:
-        remedy = f"make it writable (chown -R $USER {root}), or clone to a folder of your own"
+        remedy = f"make it writable (chown -R $USER {root}), or clone into a folder that you own"
         return Finding("disk", f"{root} cannot be written: {error.strerror}", remedy)
     free_gb = shutil.disk_usage(root).free / 1e9
     text = f"{root} is writable, {free_gb:.1f} GB free"
@@ -176,7 +176,7 @@ def check_disk(root: Path = ROOT) -> Finding:
         return Finding(
             "disk",
             text,
-            f"free {MIN_FREE_GB:.0f} GB, e.g. old run directories under runs/",
+            f"free {MIN_FREE_GB:.0f} GB, e.g. delete old run directories under runs/",
         )
     return Finding("disk", text)
 
@@ -198,7 +198,7 @@ def check_repeats(timeout_s: float = RENDER_TIMEOUT_S) -> Finding:
         text = f"two equal training steps on {threads} threads differ"
         return Finding("repeats", text, "set training.threads=1")
     text = f"frames (digest {digests.pop()}) and CPU training ({threads} threads) repeat bit for bit here"
-    text += "; not so: another number of threads or processes, another CPU or torch (rounding), times"
+    text += "; other numbers of threads or processes, another CPU or torch change the rounding"
     if torch.cuda.is_available():
         text += "; training on this GPU (for the same bits: training.device=cpu)"
     return Finding("repeats", text)

@@ -1,14 +1,14 @@
-"""Damages files in every way it can think of and reads them: only a UserError may come out, in little time and memory.
+"""Damages files in many ways and reads them: only a UserError may be raised, within bounds of time and memory.
 
 python tools/fuzz.py                            # 20,000 files over all readers
 python tools/fuzz.py --files 200 --only mcap    # fewer, of one reader
-python tools/fuzz.py --only summary --seed 17 --files 1      # a finding again
+python tools/fuzz.py --only summary --seed 17 --files 1      # reproduces a finding
 
 The readers are those of everything that somebody else may have written: recordings, checkpoints, configs, results, and
 the options of a training, which are checked before its first stage. A file is flipped, cut, spliced and stretched as
 bytes; JSON is changed as values too, and messages of a recording inside checksums that fit. Prints a line for each
-reader and exits with 1 where anything but a UserError came out, a file took longer than it may, or memory grew beyond
-its bound.
+reader and exits with 1 where anything but a UserError was raised, a file took too long, or memory grew beyond its
+bound.
 """
 
 from imfvla.command import as_command, begin
@@ -84,7 +84,7 @@ NUMBERS = (0, -1, 1e308, -1e308, 10**30, -(10**30), 2**63, 0.5, True, None, floa
 
 @dataclass(frozen=True)
 class Target:
-    """A reader and a file that it takes: `read(path of the file)`, beside whatever else it wants."""
+    """A reader and a file that it takes: `read(path of the file)`, with whatever else it needs beside it."""
 
     path: Path
     read: Callable[[Path], Any]
@@ -93,7 +93,7 @@ class Target:
 
 @dataclass
 class Tally:
-    """What became of the damaged files of a reader."""
+    """The outcome of reading a reader's damaged files."""
 
     refused: int = 0
     read: int = 0
@@ -150,7 +150,7 @@ def mutate_value(value: Any, rng: random.Random) -> Any:
 
 
 def nested(depth: int) -> "Raw":
-    """JSON of so many lists in each other."""
+    """JSON of so many nested lists."""
     return Raw("[" * depth + "]" * depth)
 
 
@@ -199,7 +199,7 @@ def check_options(path: Path) -> None:
 
 
 def mutate_yaml(data: bytes, rng: random.Random) -> bytes:
-    """Bytes, or pieces of YAML that are meant to hurt, in place of a line."""
+    """Bytes, or malicious YAML in place of a line."""
     if rng.random() < 0.6:
         return mutate_bytes(data, rng)
     lines = data.decode().splitlines()
@@ -369,7 +369,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--files", type=int, default=20_000, help="over all readers")
     parser.add_argument("--seed", type=int, default=0, help="of the first file of each reader")
-    parser.add_argument("--only", action="append", help="these readers alone")
+    parser.add_argument("--only", action="append", help="only these readers")
     parser.add_argument("--summary", type=Path, help="write the figures here too, as JSON")
     options = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

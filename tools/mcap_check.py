@@ -22,7 +22,7 @@ from imfvla.recording.mcap_file import records
 
 
 def check(path: Path) -> tuple[Episode, list[str]]:
-    """The episode at `path` and what is wrong with it. Raises UserError where it cannot be read at all."""
+    """The episode at `path` and its faults. Raises UserError where it cannot be read at all."""
     episode = read_episode(path)  # checksums, steps against messages, every picture decoded
     problems = []
     counts: Counter[int] = Counter()

@@ -4,7 +4,7 @@ python tools/mcap_to_mp4.py episode.mcap                   # writes episode.mp4 
 python tools/mcap_to_mp4.py episode.mcap -o film.mp4 --views front top
 
 A frame stays until the next one: a policy that looks once in 16 steps changes the picture about 3 times a second, while
-the time, the stage and the return in the caption go on.
+the caption keeps updating time, stage and return.
 """
 
 from imfvla.command import as_command, begin
@@ -48,7 +48,7 @@ def export(source: Path, target: Path, views: list[str] | None) -> None:
 
 
 def check_target(target: Path, overwrite: bool) -> None:
-    """Raises UserError where the video would take the place of something else, such as an evaluation's own video."""
+    """Raises UserError if the video would replace another file, such as an evaluation's own video."""
     if target.suffix != ".mp4":
         raise UserError(f"The video must be called *.mp4, found {target}.")
     if target.exists() and not overwrite:
@@ -63,7 +63,7 @@ def main() -> int:
     parser.add_argument("recordings", nargs="+", type=Path, help="MCAP files")
     parser.add_argument("-o", "--output", type=Path, help="the video, where there is one recording")
     parser.add_argument("--views", nargs="+", help="the views to show, all by default")
-    parser.add_argument("--overwrite", action="store_true", help="replace videos that are there")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing videos")
     arguments = parser.parse_args()
     if arguments.output and len(arguments.recordings) > 1:
         parser.error("--output is for one recording")

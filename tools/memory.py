@@ -37,7 +37,7 @@ PARTS = 10
 
 
 class Watched:
-    """Batches that tell of each one that is taken."""
+    """Batches that report each one that is taken."""
 
     def __init__(self, batches: Any, watch: Watch) -> None:
         self._batches, self._watch = batches, watch

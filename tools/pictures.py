@@ -1,6 +1,6 @@
 """Makes the pictures of docs/pictures.
 
-python tools/pictures.py                       # all that need nothing but what is in the repository
+python tools/pictures.py                       # all that need only files of the repository
 python tools/pictures.py rollouts socket       # some of them
 python tools/pictures.py two_sentences --multitask runs/multitask/default     # after make train EXP=multitask
 python tools/pictures.py toy --toy runs/toy                                   # after tools/toy.py --out runs/toy
@@ -53,7 +53,7 @@ SENTENCES = (10_090, 10_091)  # seeds of one start in the combined scene
 
 
 class Snapshots:
-    """A sink that keeps pictures of one view after some of the steps."""
+    """A sink that keeps pictures of one view after certain steps."""
 
     def __init__(self, view: str = "front") -> None:
         self.view, self.pictures, self.instruction = view, [], ""
@@ -124,7 +124,7 @@ def figures(names: list[str]) -> dict[str, bytes]:
 
 
 def shrunk(path: Path) -> bytes:
-    """The figure of a file in 256 colours, those that differ most: none of a legend is lost.
+    """The figure in a file with the 256 colours that differ most, so that none of a legend is lost.
 
     Raises UserError where there is none.
     """

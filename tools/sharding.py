@@ -3,7 +3,7 @@
 python tools/sharding.py                                        # two processes, two steps each way
 python tools/sharding.py --processes 4 --batch 8 size.depth=18  # with overrides of conf/train.yaml
 
-Trains on noise, on the CPU, each way in fresh processes. Prints, of the process that takes most: what it keeps between
+Trains on noise, on the CPU, each way in fresh processes. Prints, for the process that uses most: what it keeps between
 steps (parameters, AdamW's moments, average of the weights), and its resident memory between steps, at its most within
 a step and at its most while the state is saved (Linux), less what it took before there was a policy. Exits with 1
 where losses differ by more than rounding.
@@ -48,7 +48,7 @@ ENVIRONMENT = {"OMP_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": "65536"}  # wha
 
 
 class Noise:
-    """The same batch again and again; with each, the peak of memory counts anew."""
+    """The same batch again and again; each one resets the peak of memory."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         rng = torch.Generator().manual_seed(0)
@@ -130,7 +130,7 @@ def forget_peak() -> None:
 
 
 def peak() -> int:
-    """The most resident memory since it was forgotten [bytes]."""
+    """The most resident memory since the peak was reset [bytes]."""
     (line,) = (
         line
         for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines()

@@ -1,10 +1,10 @@
-"""Copies what a finished run needs to be evaluated elsewhere, and what made it, into a small directory.
+"""Copies what is needed to evaluate a finished run elsewhere, and how it was made, into a small directory.
 
 python tools/ship_policy.py runs/socket_ph32_exec16/default experiments/pretrained/socket_ph32_exec16
 python tools/ship_policy.py --without-weights runs/socket_act/default experiments/results/socket_act/default
 
 Taken are the config, the last averaged weights, the metrics of every 10th logged step and the episodes and summaries
-of the reporting band; made_by.json says with which command, commit, seed and results. Optimiser state, recordings and
+of the reporting band; made_by.json has the command, commit, seed and results. Optimiser state, recordings and
 curves stay behind, and with --without-weights, for a result that the tables are made from, the weights too.
 """
 

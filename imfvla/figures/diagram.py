@@ -37,7 +37,7 @@ class Sheet:
         size: float = 8.0,
         rounding: float = 1.0,
     ) -> None:
-        """A rounded box from its lower left corner, with a bold title at its top and lines of text below it, or in the middle."""
+        """A rounded box from its lower left corner: a bold title at its top, lines of text below or in the middle."""
         self.axes.add_patch(
             FancyBboxPatch(
                 (x + rounding, y + rounding),

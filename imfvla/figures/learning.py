@@ -103,7 +103,7 @@ def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
         value = kind.get(unit)
         detail = OUTPUTS.get(str(value), f"{unit} {_class(value) if isinstance(value, dict) else value}")
         name = GENERATOR.get(kind["class"], kind["class"] or "training loss")
-        titles.append(f"{name}, {detail}" if told else name)
+        titles.append(f"{name}, {detail}" if unit else name)
     return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]
 
 

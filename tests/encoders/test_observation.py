@@ -99,7 +99,7 @@ def test_a_bright_spot_is_located_where_it_is():
 
 
 @pytest.mark.parametrize("tokens", TOKENS)
-def test_a_small_thing_on_a_plain_table_stands_out_before_any_training(tokens):
+def test_a_small_object_on_a_plain_table_stands_out_before_any_training(tokens):
     """Moving it changes the tokens about as much as they measure, whatever the background's brightness."""
     torch.manual_seed(0)
     made = encoder(tokens=tokens)

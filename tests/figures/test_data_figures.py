@@ -90,7 +90,7 @@ def test_a_bar_of_failures_ends_at_their_share(results):
         np.testing.assert_allclose(sorted(ends), sorted(shares), atol=1e-9)
 
 
-def test_results_of_a_method_stand_together_under_its_name(results):
+def test_results_of_a_method_are_grouped_under_its_name(results):
     socket = failed_stages(of_table(results, 1)).axes[0]
     names = [label.get_text().replace("\N{FIGURE SPACE}", "") for label in socket.get_yticklabels()]
     first = names.index("Flow, high-noise times   NFE 1")
@@ -99,16 +99,16 @@ def test_results_of_a_method_stand_together_under_its_name(results):
     assert not any("=" in name for name in names)
 
 
-def test_weights_at_the_end_of_training_are_compared_over_evaluations(results):
+def test_weights_at_the_end_of_training_are_compared_over_nfe(results):
     panels = success_by_evaluations(of_table(results, 1)).axes
     lines = {
         axes.get_title(loc="left"): [len(bars.lines[0].get_xdata()) for bars in axes.containers]
         for axes in panels
     }
-    assert lines["iMF-AttnRes"] == [2]  # one evaluation is answered by a third of the training
+    assert lines["iMF-AttnRes"] == [2]  # the row of one NFE uses a third of the training
     assert lines["Diffusion-style VLA, ph32, exec16"] == [4]
     assert lines["Flow, high-noise times"] == [3]
-    assert "ACT" not in lines  # a single evaluation is no line
+    assert "ACT" not in lines  # a single NFE makes no line
 
 
 def test_changes_of_a_method_share_its_panel(tmp_path):

@@ -138,7 +138,7 @@ def test_the_sample_is_a_pure_function_of_its_noise(name):
 
 @every_generator
 @pytest.mark.parametrize("nfe", [1, 2, 100])
-def test_sampling_evaluates_the_core_nfe_times(name, nfe):
+def test_sampling_calls_the_core_nfe_times(name, nfe):
     class Counted(nn.Module):
         calls = 0
 
@@ -162,7 +162,7 @@ def test_sampling_evaluates_the_core_nfe_times(name, nfe):
 
 
 @every_generator
-def test_numbers_of_evaluations_that_make_no_sense_are_refused(name):
+def test_an_impossible_nfe_is_refused(name):
     generator, impossible = make(name), [0, -1]
     if name in MOST:
         impossible.append(MOST[name] + 1)

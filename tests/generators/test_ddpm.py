@@ -201,7 +201,7 @@ def test_impossible_choices_are_refused_by_name(changes):
         generator(**changes)
 
 
-def test_more_evaluations_than_levels_are_refused():
+def test_more_steps_than_levels_are_refused():
     with pytest.raises(UserError, match=r"between 1 and generator\.num_levels=100, found 101"):
         generator().sample(GaussianDenoiser("epsilon"), None, draw(2)[0], 101)
 

@@ -28,7 +28,7 @@ def inputs():
 
 @pytest.mark.parametrize("depth", [1, 4])
 def test_the_cached_prefix_gives_what_one_joint_pass_gives(depth):
-    """The expert's layers beside the prefix's, everything computed anew, in masked attention over both."""
+    """The expert's layers beside the prefix's, everything recomputed, in masked attention over both."""
     core = make_core(depth)
     x, t, r, context = inputs()
     times = torch.cat((core.time(t), core.interval(t - r)), -1).unsqueeze(1).expand(-1, STEPS, -1)

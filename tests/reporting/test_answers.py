@@ -135,7 +135,7 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
     text = summary.read_text()
     summary.write_text(json.dumps(json.loads(text) | {"success_episodes": 100}))
     with pytest.raises(
-        UserError, match=r"episodes\.jsonl gives success_episodes = \d+, its summary\.json says 100"
+        UserError, match=r"episodes\.jsonl gives success_episodes = \d+, but its summary\.json says 100"
     ):
         answer("socket_infer2", tmp_path)
     summary.write_text(text)

@@ -69,8 +69,8 @@ def test_table_3_follows_from_tables_1_and_2(comparison):
         assert result == comparison.paper.result
 
 
-def test_the_latencies_of_table_1_do_not_grow_with_the_evaluations():
-    """The paper says that hardware differs between rows: one evaluation is printed as slower than three."""
+def test_the_latencies_of_table_1_do_not_grow_with_nfe():
+    """The paper says that hardware differs between rows: NFE 1 is printed as slower than NFE 3."""
     assert (
         ROWS["socket_infer1"].latency_ms > ROWS["socket_infer3"].latency_ms > ROWS["socket_infer2"].latency_ms
     )

@@ -74,7 +74,7 @@ def test_the_row_as_markdown_json_and_text(run):
         assert cell in text
 
 
-def test_of_several_evaluations_the_reporting_band_and_the_last_weights_stand(run):
+def test_of_several_evaluations_the_reporting_band_and_the_last_weights_count(run):
     write_evaluation(run, 1, first_seed=10_000, step=30, gain=2)
     assert rows(RunDirectory(run))[0].summary["avg_return"] == 1500
     write_evaluation(run, 1, step=30, gain=3, max_steps=5)
@@ -127,7 +127,7 @@ def test_what_was_just_evaluated_may_be_printed_alone(run):
     assert (run / "table_row.md").read_text() == EXPECTED
 
 
-def test_episodes_that_ended_as_failed_are_told(run):
+def test_failed_episodes_are_reported(run):
     path = next(run.glob("rollouts/*_nfe4_*/summary.json"))
     path.write_text(json.dumps(json.loads(path.read_text()) | {"failures": {"non-finite action": 2}}))
     print_row(RunDirectory(run), Console(quiet=True))

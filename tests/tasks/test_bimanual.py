@@ -131,7 +131,7 @@ def test_socket_and_peg_are_drawn_independently(socket_env):
     assert np.abs(correlation).max() < 0.3
 
 
-def test_things_at_rest_stay_where_they_are(env):
+def test_objects_at_rest_stay_where_they_are(env):
     env.reset(1)
     before = {name: env.task.prop_pose(env.physics, name).position for name in env.task.props}
     for _ in range(100):
@@ -180,7 +180,7 @@ def test_cameras_are_rendered_only_when_someone_looks(env, monkeypatch):
     env.step(env.state())
 
 
-def test_views_show_the_things_in_their_colours(env):
+def test_views_show_the_objects_in_their_colours(env):
     """Vivid orange is the bar's; the socket is blue. Both are seen from above and in front at any start."""
     for seed in range(4):
         env.reset(seed)

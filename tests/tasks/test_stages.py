@@ -57,7 +57,7 @@ def peg_at(depth: float, aside: float = 0.0, tilt: float = 0.0, height: float = 
         (peg_at(0.05), 5),
     ],
 )
-def test_socket_stages_of_lifted_things(socket_task, peg, stage):
+def test_socket_stages_of_lifted_objects(socket_task, peg, stage):
     socket_task.poses = {"socket": Pose(np.array([0, 0, AIR]), np.eye(3)), "peg": peg}
     assert socket_task.stage(None) == 0
     socket_task.held = {("right", "peg")}

@@ -35,7 +35,7 @@ def test_average_closed_form():
     assert ema.policy.weight.item() == pytest.approx(expected)
 
 
-def test_copies_buffers_and_stands_apart():
+def test_copies_buffers_and_shares_no_memory():
     source = nn.BatchNorm1d(2)
     ema = Ema(source, limit=0.9)
     source(torch.randn(8, 2))

@@ -26,7 +26,7 @@ TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
 
 
 class Killed(BaseException):
-    """Stands for SIGKILL: nothing catches it."""
+    """Imitates SIGKILL: nothing catches it."""
 
 
 class DiesAt(TinyPolicy):

@@ -1,1 +1,1 @@
-"""Faults of tools/chaos.py: each puts one into real processes and compares what is left with an undisturbed run."""
+"""Faults of tools/chaos.py: each injects one into real processes and compares the result with an undisturbed run."""

@@ -19,7 +19,7 @@ from imfvla.training.checkpoint import read_tensors
 
 
 def disk(folder: Path, kills: int, rng: random.Random) -> str:
-    """A full disk, a read-only one, no file handles: an error that says so, the last state whole, then it goes on."""
+    """A full disk, a read-only one, no file handles: a clear error, the last state intact, then training resumes."""
     work = partial(train, steps=200)
     undisturbed(work, folder / "whole")
     mounted = folder / "small"
@@ -51,11 +51,11 @@ def disk(folder: Path, kills: int, rng: random.Random) -> str:
         subprocess.run(["umount", str(mounted)], check=False)
     for what, words in said.items():
         print(f"    {what}: {words}")
-    return f"{len(said)} faults, exit code 2 each time; then {equal} parts equal bit for bit"
+    return f"{len(said)} faults, each with exit code 2; then {equal} parts equal bit for bit"
 
 
 def without_handles(work: Work, folder: Path) -> None:
-    """Leaves two handles: enough to open the logs, too few to save beside them."""
+    """Leaves two handles: enough to open the logs, too few to save as well."""
     highest = max(map(int, os.listdir("/proc/self/fd")))
     while os.dup(0) <= highest:  # fills the gaps
         pass
@@ -64,7 +64,7 @@ def without_handles(work: Work, folder: Path) -> None:
 
 
 def fails(work: Work, folder: Path, number: int) -> str:
-    """What the user sees. Raises Differs where it is no clear error, the state is not whole or a half file is left."""
+    """The error that the user sees. Raises Differs if it is unclear, the state damaged or a partial file left."""
     log = folder.parent.parent / f"{errno.errorcode[number]}.log"  # on another file system
     link = Path(f"{folder}.log")
     with suppress(OSError):
@@ -81,7 +81,7 @@ def fails(work: Work, folder: Path, number: int) -> str:
 
 
 def start_logging(work: Work, folder: Path, log: Path) -> int:
-    """As `start`, with what it says in `log`."""
+    """As `start`, with the output in `log`."""
 
     def logged(_: Path) -> None:
         output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)

@@ -1,4 +1,4 @@
-"""SIGKILL at random moments over one piece of work, every second one while a file is being written."""
+"""SIGKILL at random moments of one piece of work, every second time while a file is being written."""
 
 import os
 import random
@@ -18,7 +18,7 @@ Work = Callable[[Path], None]
 
 
 def start(work: Work, folder: Path) -> int:
-    """The process that does `work`; what it says goes to `folder`.log."""
+    """The process that does `work`; its output goes to `folder`.log."""
     sys.stdout.flush()
     child = os.fork()
     if child:
@@ -36,7 +36,7 @@ def start(work: Work, folder: Path) -> int:
 
 
 def last_words(folder: Path) -> str:
-    """The end of what the processes of a folder have said."""
+    """The end of the output of a folder's processes."""
     return Path(f"{folder}.log").read_text(encoding="utf-8")[-500:]
 
 
@@ -74,12 +74,12 @@ def progress_of(folder: Path) -> int:
 
 
 def files_of(folder: Path) -> Iterator[Path]:
-    """All files in a folder, from which some vanish meanwhile."""
+    """All files in a folder; some may vanish while it is read."""
     return (Path(place, name) for place, _, names in os.walk(folder) for name in names)
 
 
 def content(path: Path) -> bytes:
-    """Of a file; nothing where it has vanished."""
+    """Of a file; nothing if it has vanished."""
     with suppress(FileNotFoundError):
         return path.read_bytes()
     return b""
@@ -88,10 +88,10 @@ def content(path: Path) -> bytes:
 def kill_over(
     work: Work, folder: Path, kills: int, amount: int, rng: random.Random, *, spread_s: float = 0.02
 ) -> tuple[int, int]:
-    """Starts `work` until it ends by itself, killing it up to `kills` times, `amount` units of progress over all.
+    """Restarts `work` until it ends by itself, killing it up to `kills` times over `amount` units of progress.
 
-    A kill that waits for no write comes up to `spread_s` seconds after some progress. Returns the kills, and how many
-    of them fell into a write: a half-written file was there afterwards.
+    A kill that waits for no write comes up to `spread_s` seconds after some progress. Returns the number of kills, and
+    how many of them interrupted a write: a partial file was left.
     """
     done = during_write = 0
     while True:
@@ -123,13 +123,13 @@ def kill_over(
 
 
 def ended_or_late(child: int, deadline: float) -> bool:
-    """Whether to go on waiting: the child runs and there is time."""
+    """Whether to keep waiting: the child runs and there is time left."""
     info = os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     return info is None and time.monotonic() < deadline
 
 
 def undisturbed(work: Work, folder: Path) -> None:
-    """Does it once, in a process like those that are killed."""
+    """Runs the work once, in a process like those that are killed."""
     _, status = os.waitpid(start(work, folder), 0)
     if code := os.waitstatus_to_exitcode(status):
         raise Differs(
@@ -138,7 +138,7 @@ def undisturbed(work: Work, folder: Path) -> None:
 
 
 def kills_of(work: Work, leaves: Callable[[Path], dict[str, Any]], amount: int) -> Callable[..., str]:
-    """A fault: SIGKILL over one piece of work."""
+    """A fault: SIGKILL during one piece of work."""
 
     def inject(folder: Path, kills: int, rng: random.Random) -> str:
         undisturbed(work, folder / "whole")
@@ -146,6 +146,6 @@ def kills_of(work: Work, leaves: Callable[[Path], dict[str, Any]], amount: int) 
         equal = compare(leaves(folder / "killed"), leaves(folder / "whole"))
         if done < kills:
             raise Differs(f"ended after {done} of {kills} kills")
-        return f"{done} kills, {during_write} of them into a write; {equal} parts equal bit for bit"
+        return f"{done} kills, {during_write} of them during a write; {equal} parts equal bit for bit"
 
     return inject

@@ -1,4 +1,4 @@
-"""What work leaves in its folder, and whether it is equal to what undisturbed work leaves."""
+"""The files that work leaves in its folder, compared with those of undisturbed work."""
 
 import json
 from pathlib import Path
@@ -13,15 +13,15 @@ from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
-NOT_OF_WORK = {"train_s", "code"}  # of a state's header: somebody may commit meanwhile
+NOT_OF_WORK = {"train_s", "code"}  # of a state's header: somebody may commit in the meantime
 
 
 class Differs(Exception):
-    """Something is not as it is after an undisturbed run."""
+    """The outcome differs from that of an undisturbed run."""
 
 
 def state_of(folder: Path) -> dict[str, Any]:
-    """Everything that a training leaves, times apart."""
+    """Everything that a training leaves, except times."""
     run = RunDirectory(folder)
     files = {"state": run.last_state} | {f"step {s}": run.policy_weights(s) for s in run.weight_steps()}
     found: dict[str, Any] = {}
@@ -36,7 +36,7 @@ def state_of(folder: Path) -> dict[str, Any]:
 
 
 def rows_of(folder: Path) -> dict[str, Any]:
-    """Everything that evaluations leave, times apart."""
+    """Everything that evaluations leave, except times."""
     found: dict[str, Any] = {}
     for rollouts in sorted((folder / "rollouts").iterdir()):
         rows = [
@@ -64,7 +64,7 @@ def demonstrations_of(folder: Path) -> dict[str, Any]:
             found |= {
                 f"{path.name} {view}": torch.from_numpy(images) for view, images in episode.images.items()
             }
-        elif path.suffix not in (".part", ".trial"):  # of a kill; begun anew when its seed is played
+        elif path.suffix not in (".part", ".trial"):  # left by a kill; overwritten when its seed is played
             found[path.name] = path.read_text(encoding="utf-8")
     return found
 

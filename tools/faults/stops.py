@@ -17,7 +17,7 @@ from imfvla.training.logger import read_metrics
 
 
 def stops(folder: Path, kills: int, rng: random.Random) -> str:
-    """Signals that ask to stop: the state of the step is saved, the exit code says which it was."""
+    """Signals that ask to stop: the state of the step is saved, the exit code names the signal."""
     work = partial(train, steps=120)
     rarely = partial(train, steps=120, save_every_s=1e9)
     undisturbed(work, folder / "whole")

@@ -1,4 +1,4 @@
-"""SIGKILL over a whole sweep: composing, training, evaluating and writing rows, from one job to the next."""
+"""SIGKILL during a whole sweep: composing, training, evaluating and writing rows, from one job to the next."""
 
 import os
 import random
@@ -41,7 +41,7 @@ class Size:
 
 
 def runs_of(folder: Path) -> dict[str, Any]:
-    """Everything that the jobs leave, times apart, and their rows of the table."""
+    """Everything that the jobs leave, except times, and their rows of the table."""
     found: dict[str, Any] = {"table": tiny_sweep.untimed_table(folder)}
     for path in sorted((folder / "runs").glob("*/*")):
         run = RunDirectory(path)
@@ -53,7 +53,7 @@ def runs_of(folder: Path) -> dict[str, Any]:
 
 
 def sweep(folder: Path, kills: int, rng: random.Random) -> str:
-    """Killed until it comes to its end; what no kill has touched is not done again."""
+    """Killed and restarted to its end; work that no kill interrupted is not repeated."""
     size = Size.of(kills)
     whole, killed = folder / "whole", folder / "killed"
     for place in (whole, killed):
@@ -70,6 +70,6 @@ def sweep(folder: Path, kills: int, rng: random.Random) -> str:
     if len(times) != steps or repeated > kills:
         raise Differs(f"{len(times)} steps of {steps} were taken, {repeated} more than once")
     return (
-        f"{done} kills, {during_write} of them into a write; {repeated} of {steps} steps were taken again; "
+        f"{done} kills, {during_write} of them during a write; {repeated} of {steps} steps were repeated; "
         f"{equal} parts of {size.jobs} runs equal bit for bit"
     )

@@ -1,4 +1,4 @@
-"""SIGKILL of one of two processes that torchrun started: it starts both again, and they go on from the last state."""
+"""SIGKILL of one of two processes that torchrun started: it restarts both, and they resume from the last state."""
 
 import os
 import random
@@ -19,7 +19,7 @@ from faults.outcome import Differs, compare, state_of
 STEPS = 60
 HELD = {"whole": "none", "in parts": "full"}  # what each process holds of the policy: training.sharding
 SPREAD_S = 0.05
-TIMEOUT_S = 900.0  # of one start, on a machine that is busy with other work
+TIMEOUT_S = 900.0  # for one start, on a machine that is busy with other work
 
 
 def torchrun(folder: Path, kills: int, rng: random.Random) -> str:
@@ -44,7 +44,7 @@ def jobs_in(folder: Path) -> list[processes.Job]:
 
 
 def undisturbed_pair(folder: Path) -> None:
-    """The same in two processes that this one forks, which saves them the start."""
+    """The same in two processes that this one forks, which saves the start of Python."""
     jobs = jobs_in(folder)
     with socket() as free:
         free.bind(("localhost", 0))
@@ -62,7 +62,7 @@ def undisturbed_pair(folder: Path) -> None:
 
 
 def killed_over(folder: Path, kills: int, rng: random.Random) -> list[str]:
-    """Kills at random moments until there have been `kills`, then waits for the end; which training each fell into."""
+    """Kills at random moments until there have been `kills`, waits for the end, returns which training each hit."""
     log, during = folder / "killed.log", []
     command = processes.torchrun(jobs_in(folder / "killed"), folder / "jobs.json", restarts=kills)
     with started(command, log) as run:
@@ -90,14 +90,14 @@ def killed_over(folder: Path, kills: int, rng: random.Random) -> list[str]:
 
 
 def started(command: list[str], log: Path) -> subprocess.Popen:
-    """torchrun, with what all processes say in `log`."""
+    """torchrun, with the output of all processes in `log`."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with open(log, "wb") as output:
         return subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
 
 
 def workers_of(pid: int) -> set[int]:
-    """Processes that torchrun has started and that live."""
+    """Living processes that torchrun has started."""
     children = psutil.Process(pid).children()
     return {child.pid for child in children if child.status() != psutil.STATUS_ZOMBIE}
 
