@@ -192,3 +192,19 @@ def begins_first(command: Path) -> bool:
     before |= {name.name for node in body[:guard] if isinstance(node, ast.Import) for name in node.names}
     begins = guard < len(body) and ast.unparse(body[guard]).endswith("\n    begin()")
     return begins and before <= {"imfvla.command", "sys", "pathlib"}
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        "pretrained/socket_ph32_exec16/table_row.md",
+        "pretrained/socket_ph32_exec16/rollouts/seeds100000-100099_nfe4/summary.json",
+        "results/socket_act/default/table_row.json",
+        "report/index.html",
+    ],
+)
+def test_what_evaluating_and_reporting_leave_in_the_checkout_is_ignored(left):
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a checkout")
+    ignored = subprocess.run(["git", "check-ignore", "-q", f"experiments/{left}"], cwd=ROOT, check=False)
+    assert ignored.returncode == 0

@@ -9,8 +9,9 @@ from synthetic_runs import STEPS, answer_row, make_run, write_evaluation
 
 from imfvla.composition import compose
 from imfvla.errors import UserError
-from imfvla.reporting.answers import Sources, check_equal_protocols
+from imfvla.reporting.answers import Sources, check_equal_protocols, read_evaluated
 from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.metrics import summarise
 from imfvla.reporting.runs import rows
 from imfvla.run_directory import RunDirectory
 
@@ -143,6 +144,18 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
     episodes.write_text(episodes.read_text()[:-30])
     with pytest.raises(UserError, match=r"episodes\.jsonl, line 100 is cut off"):
         answer("socket_infer2", tmp_path)
+
+
+def test_a_metric_that_the_summary_does_not_have_yet_is_left_out(tmp_path, monkeypatch):
+    write_evaluation(make_run(tmp_path / "a", "socket_ph32_exec16"), 2)
+    monkeypatch.setattr(
+        "imfvla.reporting.answers.summarise", lambda rows: summarise(rows) | {"new_metric": 1}
+    )
+    assert [len(found.episodes) for found in read_all(tmp_path)] == [20]
+
+
+def read_all(directory: Path):
+    return [read_evaluated(found) for found in Sources([directory]).evaluations[0]]
 
 
 def test_a_missing_run_is_proposed_with_all_evaluations_of_its_rows(tmp_path):
