@@ -89,7 +89,7 @@ class Report:
 
 def check_demonstrations(config: Mapping[str, Any]) -> None:
     """Raises UserError where `config` (train.yaml composed) asks for demonstrations that cannot be recorded."""
-    _, settings = _read(*(part_of(config, key) for key in ("task", "observation", "demos")), "demos")
+    _, settings = read_settings(*(part_of(config, key) for key in ("task", "observation", "demos")), "demos")
     _stage_for(settings)
 
 
@@ -114,7 +114,7 @@ def collect(
     Raises:
         UserError: bad options, a folder recorded with other settings, no seeds or no disk space left.
     """
-    options, settings = _read(task, observation, demos, where)
+    options, settings = read_settings(task, observation, demos, where)
     # Reports what cannot be simulated before anything is written.
     _stage_for(settings)
     began = time.perf_counter()
@@ -136,9 +136,10 @@ def collect(
     return Report(Recordings.named(directory, names, name), num_new, num_failed, time.perf_counter() - began)
 
 
-def _read(
+def read_settings(
     task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str
 ) -> tuple[DemoOptions, Settings]:
+    """The checked options of a collection; `where` is the group of `demos` in messages. Raises UserError."""
     options = build(DemoOptions, demos, where)
     expert = build(ExpertOptions, part_of({"task": task}, "task.expert"), "task.expert")
     seen = {

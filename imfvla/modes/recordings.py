@@ -10,7 +10,7 @@ from imfvla.collection import (
     LOG_NAME,
     Settings,
     folder_name,
-    read_options,
+    read_settings,
     record_demonstration,
     recorded_seeds,
     recording_path,
@@ -32,7 +32,7 @@ def settings_of(config: Mapping[str, Any]) -> Settings:
     """How the demonstrations of a run were recorded, also of one that is older than some of the settings."""
     task, demos = config["task"], config["demos"]
     task = {**task, "expert": LATER_SETTINGS | task["expert"]}
-    _, settings = read_options(task, config["observation"], {"frames_directory": None} | demos)
+    _, settings = read_settings(task, config["observation"], {"frames_directory": None} | demos, "demos")
     return settings
 
 

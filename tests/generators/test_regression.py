@@ -3,6 +3,8 @@ import torch
 from closed_forms import MEAN, STEPS, Context, Recorded, draw
 from torch import nn
 
+from imfvla.composition import compose
+from imfvla.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.regression import Regression
 
@@ -19,7 +21,7 @@ def test_the_loss_is_the_mean_absolute_error_over_valid_steps():
     actions, _, _ = draw(2)
     valid = torch.ones(2, STEPS, dtype=torch.bool)
     valid[1, 1:] = False
-    loss, logs = Regression(clip=10.0).loss(Constant(), Context(), actions, valid, torch.Generator())
+    loss, logs = Regression(clip=10.0, power=1).loss(Constant(), Context(), actions, valid, torch.Generator())
     error = (actions - MEAN).abs()
     torch.testing.assert_close(loss, torch.stack((error[0].mean(), error[1, 0].mean())))
     torch.testing.assert_close(logs["absolute_error"], loss.mean())
@@ -56,18 +58,19 @@ def test_the_optimum_is_the_median_or_the_mean(power, optimum):
 
 
 def test_another_power_is_refused():
-    with pytest.raises(UserError, match=r"^generator\.power must be 1 or 2, found 3\.$"):
-        Regression(clip=10.0, power=3)
+    config = compose("train", ["generator=l1", "generator.power=3"])
+    with pytest.raises(UserError, match=r"^generator\.power must be .*1.*2.*, found 3\.$"):
+        construct(config["generator"], "generator")
 
 
 def test_the_noise_changes_nothing():
     core, (noise, _, _) = Recorded(), draw(4)
-    chunk = Regression(clip=10.0).sample(core, None, noise, 1)
-    assert torch.equal(chunk, Regression(clip=10.0).sample(core, None, 7 * noise, 1))
+    chunk = Regression(clip=10.0, power=1).sample(core, None, noise, 1)
+    assert torch.equal(chunk, Regression(clip=10.0, power=1).sample(core, None, 7 * noise, 1))
 
 
 def test_the_prediction_is_clamped():
-    chunk = Regression(clip=0.2).sample(Constant(), None, draw(4)[0], 1)
+    chunk = Regression(clip=0.2, power=1).sample(Constant(), None, draw(4)[0], 1)
     assert torch.equal(chunk, MEAN.clamp(-0.2, 0.2).expand_as(chunk))
 
 

@@ -1,14 +1,16 @@
 """Clipping by the gradients' scale: outliers alone, whatever the loss."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 from tiny_policy import OPTIM
 
 from imfvla.errors import UserError
+from imfvla.options import build
 from imfvla.training.clipping import Clipping
+from imfvla.training.options import OptimOptions
 
 
 def clipped_steps(norms, factor=2.0, norm=None):
@@ -57,4 +59,4 @@ def test_a_fixed_norm_is_one_for_all():
 @pytest.mark.parametrize(("key", "value"), [("clip_factor", 1.0), ("clip_norm", 0.0)])
 def test_limits_that_would_stop_learning_are_refused(key, value):
     with pytest.raises(UserError, match=rf"optim\.{key}"):
-        replace(OPTIM, **{key: value})
+        build(OptimOptions, asdict(replace(OPTIM, **{key: value})), "optim")

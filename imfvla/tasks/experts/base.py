@@ -56,10 +56,10 @@ class Hand:
         carrot = Pose(self.pose.position + ahead, rotation_matrix(turn) @ self.pose.rotation)
         self.command = np.append(self._kinematics.solve(carrot, self.joints), opening)
 
-    def carry(self, thing: Pose, goal: Pose) -> Pose:
-        """Where the hand must go for the thing that it holds to reach `goal`."""
-        turn = goal.rotation @ thing.rotation.T
-        return Pose(goal.position + turn @ (self.pose.position - thing.position), turn @ self.pose.rotation)
+    def carry(self, held: Pose, goal: Pose) -> Pose:
+        """Where the hand must go for the object that it holds to reach `goal`."""
+        turn = goal.rotation @ held.rotation.T
+        return Pose(goal.position + turn @ (self.pose.position - held.position), turn @ self.pose.rotation)
 
     def is_at(self, goal: Pose, distance: float, angle: float) -> bool:
         near = np.linalg.norm(goal.position - self.pose.position) < distance
@@ -73,7 +73,7 @@ class Expert:
         modes: 1 each gripper turns the same way in every episode; 2 the right one's way is drawn from the seed;
             4 both are drawn, independently. Nothing in the observation shows what was drawn.
         noise: standard deviation [rad] of the joint noise that is executed but not recorded as action.
-        hold: control steps for which a demonstration goes on after success, so that holding is shown too.
+        hold: control steps for which a demonstration continues after success, so that it shows holding too.
         dwell: mean of the geometric time [control steps] that the transfer expert waits with its left hand around the
             bar before it closes; 0 closes at once. Nothing in the observation shows how long it will wait.
     """
@@ -153,13 +153,13 @@ class Expert:
             self._steps_since_success += 1
         return self._steps_since_success >= self.hold
 
-    def pick(self, hand: Hand, thing: Pose, grasp: np.ndarray) -> Pose:
-        """Commands the approach to the point `grasp` (3,) of a thing on the table and the closing of the gripper.
+    def pick(self, hand: Hand, target: Pose, grasp: np.ndarray) -> Pose:
+        """Commands the approach to the point `grasp` (3,) of an object on the table and the closing of the gripper.
 
         The hand comes down in a funnel: the closer it is in the plane and in yaw, the lower it may be.
         """
-        yaw = np.arctan2(thing.rotation[1, 0], thing.rotation[0, 0]) + self.turn[hand.side] * np.pi / 2
-        at = thing.at(grasp)
+        yaw = np.arctan2(target.rotation[1, 0], target.rotation[0, 0]) + self.turn[hand.side] * np.pi / 2
+        at = target.at(grasp)
         goal = Pose(np.array([at[0], at[1], GRASP_HEIGHT]), about_z(yaw))
         aside = np.linalg.norm(goal.position[:2] - hand.pose.position[:2])
         turn = np.linalg.norm(rotation_vector(goal.rotation @ hand.pose.rotation.T))
@@ -169,13 +169,13 @@ class Expert:
         hand.move(above, 0.0 if ready else 1.0, self.speed)
         return goal
 
-    def lift(self, thing: Pose, goal: Pose, rest_height: float) -> Pose:
-        """`goal`, but straight up first: the thing moves aside and turns as far as it has been lifted."""
-        share = np.clip((thing.position[2] - rest_height - 0.01) / 0.05, 0, 1)
-        aside = thing.position + share * (goal.position - thing.position)
-        turn = rotation_vector(goal.rotation @ thing.rotation.T)
+    def lift(self, held: Pose, goal: Pose, rest_height: float) -> Pose:
+        """`goal`, but straight up first: the object moves aside and turns as far as it has been lifted."""
+        share = np.clip((held.position[2] - rest_height - 0.01) / 0.05, 0, 1)
+        aside = held.position + share * (goal.position - held.position)
+        turn = rotation_vector(goal.rotation @ held.rotation.T)
         return Pose(
-            np.array([aside[0], aside[1], goal.position[2]]), rotation_matrix(share * turn) @ thing.rotation
+            np.array([aside[0], aside[1], goal.position[2]]), rotation_matrix(share * turn) @ held.rotation
         )
 
 
