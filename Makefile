@@ -18,7 +18,7 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations campaign bench tables report gallery test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
@@ -45,8 +45,9 @@ sweep-socket:  ## Train and evaluate every row of Table 1 (ARGS="seed=0,1,2")
 sweep-transfer:  ## Train and evaluate every row of Table 2
 sweep-horizon:  ## Vary predicted and executed steps
 sweep-evaluations:  ## Evaluate with 1 to 10 steps per chunk
+sweep-dwell:  ## Train and evaluate every method on the task where averages fail
 sweep-demonstrations:  ## Train on 25 to 200 demonstrations
-sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations: sweep-%: setup
+sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell: sweep-%: setup
 	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
 
 campaign: setup  ## Train, evaluate and keep every policy of Tables 1 and 2 and the controls (ARGS="--side-by-side 2")
