@@ -28,6 +28,7 @@ class StagedMeanFlow(AverageVelocity):
     average_from: share of the training after which the average velocity is learned, in [0, 1).
     path_steps: Euler steps along the flow from which an average velocity is taken.
     average_weight: of its loss.
+    boundary_share: of the intervals, the share that is (0, 1). At 1, one step is taken with u and more with v.
     The rest as in `AverageVelocity`: `compound_draws` is how many draws of an observation are intervals.
     """
 
@@ -71,6 +72,11 @@ class StagedMeanFlow(AverageVelocity):
                 v = self.instant_velocity(core, z, t + (r - t) * (k / self.path_steps), context)
                 total, z = total + v, z - length * v
         return total / self.path_steps
+
+    def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
+        """A chunk (B, H, A): one step of u; more of them too, or of v where u has learned the whole interval alone."""
+        takes_average = nfe == 1 or self.boundary_share < 1
+        return super().sample(core if takes_average else self.instant_core(core), context, noise, nfe)
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator

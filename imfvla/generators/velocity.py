@@ -3,6 +3,7 @@
 Shapes: B batch, N draws per observation, H steps, A action.
 """
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -134,9 +135,13 @@ class AverageVelocity(LinearPath):
 
     def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
         """v(z, t), of blocks of its own where the core has them, else u(z, t, t): z (B, H, A), t (B,) -> (B, H, A)."""
+        return self.velocity(self.instant_core(core), z, t, t, context)
+
+    def instant_core(self, core: nn.Module) -> Callable[[Tensor, Tensor, Tensor, Any], Tensor]:
+        """What answers (z, t, r, context) as the blocks of v do, whatever r."""
         if self.core_interface == "flow":
-            return self.velocity(core, z, t, t, context)
-        return self.velocity(lambda z, t, r, context: core.instant(z, t, context), z, t, t, context)
+            return lambda z, t, r, context: core(z, t, t, context)
+        return lambda z, t, r, context: core.instant(z, t, context)
 
     def derivative(
         self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any

@@ -152,6 +152,20 @@ def test_the_average_s_loss_reaches_its_own_blocks_alone():
     assert all(gradient is not None for gradient in average)
 
 
+@pytest.mark.parametrize("parametrisation", ["velocity", "data"])
+def test_more_steps_than_one_follow_v_where_the_average_is_of_the_whole_interval_alone(parametrisation):
+    """An average that is off by 1 everywhere shows in the one step that is taken with it."""
+    noise, _, _ = draw(8)
+    core, flow = ExactFlow(parametrisation, off=1.0), ExactFlow(parametrisation)
+    whole = generator(parametrisation=parametrisation, boundary_share=1.0)
+    exact = MEAN + STD * noise
+    torch.testing.assert_close(whole.sample(core, None, noise, 1), exact - 1)
+    torch.testing.assert_close(whole.sample(core, None, noise, 400), exact, rtol=0, atol=0.02)
+    parts = generator(parametrisation=parametrisation, boundary_share=0.9)
+    assert (parts.sample(core, None, noise, 2) - exact).abs().min() > 0.3
+    torch.testing.assert_close(parts.sample(flow, None, noise, 2), exact)
+
+
 @pytest.mark.parametrize("change", ["average_from=1.0", "average_from=-0.1", "path_steps=0"])
 def test_impossible_choices_are_refused_by_name(change):
     config = compose("train", ["generator=imf_staged", f"generator.{change}"])
