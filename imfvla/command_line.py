@@ -58,6 +58,10 @@ def refuse_ignored(known: argparse.Namespace, is_sweep: bool) -> None:
         )
     for override in known.overrides:
         key = override.lstrip("+~").partition("=")[0]
+        if is_sweep and key.startswith("hydra.sweeper.params"):
+            raise UserError(
+                f"{key} works only in a config file: on the command line write the choices themselves, as in seed=0,1."
+            )
         if not is_sweep and key.startswith(OF_SWEEPS):
             raise UserError(f"{key} acts only in a sweep: add -m, or drop it.")
         if is_sweep and key.startswith(OF_SINGLE_JOBS):

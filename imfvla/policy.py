@@ -74,7 +74,7 @@ class Policy(nn.Module):
             )
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
-        """Action chunks (K B, Tp, A) in physical units from noise (K B, Tp, A) and `nfe` evaluations of the core.
+        """Action chunks (K B, Tp, A) in physical units from noise (K B, Tp, A) and `nfe` calls of the core.
 
         Each observation is encoded once and serves K rows of noise that lie side by side.
         """

@@ -43,7 +43,7 @@ def run_episode(
       env: a `BimanualEnvironment` (see `imfvla.tasks`).
       actor: an `episode.Actor`; its `style`, where it has one, goes into the recording's metadata.
       seed: draws the start state, and whatever the actor draws.
-      sinks: recorders, begun in order after the reset and ended in order after the last step.
+      sinks: recorders; they begin in order after the reset and end in order after the last step.
       kind: "demonstration" or "rollout".
       config: attached to the recording in full.
       metadata: policy name, nfe and the like.

@@ -58,6 +58,7 @@ def test_without_a_sweep_the_other_folder_is_looked_in_too(mine, tmp_path):
         (["-m", "seed=0,1", "hydra.sweep.subdir=one"], "would share runs/one, though seed was 0, is 1"),
         (["-m", "seed=0,1", "hydra.sweep.subdir=${hydra.job.num}"], "hydra.sweep.subdir must depend only on"),
         (["--config-dir", "{more}", "-m", "+exp=mine,socket_act"], "has hydra.sweeper.params of its own"),
+        (["-m", "+hydra.sweeper.params.seed='0,1'"], "hydra.sweeper.params.seed works only in a config"),
         (["seed=0", "hydra.job.chdir=true"], "hydra.job.chdir must be false"),
     ],
 )

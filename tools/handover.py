@@ -44,7 +44,7 @@ class ActionLog:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run of the transfer task")
-    parser.add_argument("--nfe", type=int, default=1, help="evaluations of the network")
+    parser.add_argument("--nfe", type=int, default=1, help="network steps per chunk")
     parser.add_argument("--first-seed", type=int, default=100_000, help="of the start states")
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()

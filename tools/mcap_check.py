@@ -54,10 +54,19 @@ def agree(statistics: Statistics, counts: Counter[int]) -> bool:
     return statistics.message_count == counts.total() and +by_channel in (counts, Counter())
 
 
+def named_path(text: str) -> Path:
+    """A path of the command line; an empty one, as of an unset shell variable, is refused."""
+    if not text:
+        raise argparse.ArgumentTypeError("a path is empty")
+    return Path(text)
+
+
 @as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("paths", nargs="+", type=Path, help="MCAP files, or directories to search for them")
+    parser.add_argument(
+        "paths", nargs="+", type=named_path, help="MCAP files, or directories to search for them"
+    )
     arguments = parser.parse_args()
     files = [
         file

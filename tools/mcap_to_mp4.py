@@ -67,6 +67,9 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.output and len(arguments.recordings) > 1:
         parser.error("--output is for one recording")
+    for source in arguments.recordings:
+        if not source.name:
+            parser.error("a recording has no name: it must be an MCAP file")
     targets = [arguments.output or source.with_suffix(".mp4") for source in arguments.recordings]
     for target in targets:
         check_target(target, arguments.overwrite)

@@ -40,7 +40,7 @@ from imfvla.training.checkpoint import load_policy
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run")
-    parser.add_argument("--nfe", type=int, nargs="+", default=[1], help="evaluations of the network")
+    parser.add_argument("--nfe", type=int, nargs="+", default=[1], help="network steps per chunk")
     parser.add_argument("--checkpoint", default="last", help="training step of the weights, a share, or last")
     parser.add_argument("--demos", type=Path, help="folder of demonstrations; those trained on are left out")
     parser.add_argument(

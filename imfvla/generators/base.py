@@ -26,7 +26,7 @@ class Generator(Protocol):
         ...
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
-        """A chunk (B, H, A) from noise (B, H, A) with `nfe` evaluations of the core: a pure function."""
+        """A chunk (B, H, A) from noise (B, H, A) with `nfe` calls of the core: a pure function."""
         ...
 
     def check_nfe(self, nfe: int) -> None:
@@ -91,5 +91,5 @@ def masked_error(error: Tensor, valid: Tensor) -> Tensor:
 
 
 def refuse_nfe(wanted: str, nfe: int) -> UserError:
-    """The error of a generator that needs `wanted` evaluations of the core and was asked for `nfe`."""
-    return UserError(f"nfe, the number of evaluations of the core, must be {wanted}, found {nfe}.")
+    """The error of a generator that needs `wanted` calls of the core and was asked for `nfe`."""
+    return UserError(f"nfe, the number of network steps, must be {wanted}, found {nfe}.")

@@ -136,4 +136,4 @@ def _grid(
 
 def _ruled(head: Sequence[str]) -> Iterator[Line]:
     yield from map(Line, head)
-    yield Line("─" * max(map(len, head)))
+    yield Line("-" * max(map(len, head)))

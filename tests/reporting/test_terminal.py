@@ -78,5 +78,5 @@ def test_a_narrow_terminal_has_paper_and_ours_side_by_side():
 
 
 def test_a_table_of_one_column_or_of_no_row_is_printed():
-    assert printed(Table("T", ("a",), (("x",),)), 40)[2:] == ["a", "─", "x"]
+    assert printed(Table("T", ("a",), (("x",),)), 40)[2:] == ["a", "-", "x"]
     assert printed(Table("T", COLUMNS, (), ("There are none.",)), 40)[1:] == ["T", "", "There are none."]
