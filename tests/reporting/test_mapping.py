@@ -51,7 +51,7 @@ def test_the_training_seed_is_no_part_of_what_a_directory_says():
         ("nfe: 2 }", "nfee: 2 }", r"line \d+, table1, row \d+\.nfee \(did you mean nfe\?\)"),
         ("nfe: 2 }", "nfe: 0 }", r"line \d+, table1, row 4: nfe must be at least 1, found 0"),
         ("nfe: 2 }", "nfe: two }", r"line \d+, table1, row 4\.nfe must be a whole number, found 'two'"),
-        ("checkpoint: 1/3", "checkpoint: 4/3", r"line 13, table1, row 1: checkpoint must be last or a share"),
+        ("checkpoint: 1/3", "checkpoint: 4/3", r"line 14, table1, row 1: checkpoint must be last or a share"),
         ("ACT (action chunking)", "ACT (chunks)", r"row 6: unknown row of the paper's Table 1 'ACT \(chunks\)'"),
         ("row: socket_infer3", "row: socket_infer4", r"table3, row 1: unknown row 'socket_infer4' \(did you mean"),
         ("name: socket_act", "name: socket_infer1", r"row 6: the name socket_infer1 is taken by .*row 1"),
