@@ -57,9 +57,13 @@ class Policy(nn.Module):
         if hasattr(self.generator, "begin_step"):
             self.generator.begin_step(self.core, step, steps)
 
+    def targets(self, batch: Batch) -> Tensor:
+        """The normalised chunks (B, Tp, A) that the generator learns, held behind an episode's end."""
+        return self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
+
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
-        actions = self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
+        actions = self.targets(batch)
         context = self.core.condition(self.encoder(batch.obs))
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
         return loss.mean(), logs

@@ -19,6 +19,7 @@ from imfvla.composition import compose
 from imfvla.construction import construct
 from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.linear import Linear
+from imfvla.nn.transformer import copy_weights
 from imfvla.training.ema import Ema
 
 NUM_MODES, RADIUS, DEVIATION, SCALE = 8, 2.0, 0.1, 1 / math.sqrt(2)
@@ -104,12 +105,9 @@ class PlaneCore(nn.Module):
         """What the layers of the instantaneous velocity say, r = t."""
         return self.layers(x, t, t)
 
-    @torch.no_grad()
     def start_average(self) -> None:
         """The layers of the average velocity take the weights of those of the instantaneous one."""
-        learned = dict(self.named_parameters())
-        for name, parameter in self.average.named_parameters():
-            parameter.copy_(learned[name])
+        copy_weights(self, self.average)
 
     def layers(self, x: Tensor, t: Tensor, r: Tensor) -> Tensor:
         condition = self.time(t) + self.interval(t - r)

@@ -13,7 +13,7 @@ from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
-from imfvla.policy import Policy, hold_last
+from imfvla.policy import Policy
 from imfvla.recording import Recordings
 from imfvla.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
@@ -86,9 +86,12 @@ def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -
         with _timed(spent, "encoder"):
             context = policy.core.condition(policy.encoder(batch.obs))
         with _timed(spent, "core"), _timed_derivative(policy.generator, spent):
-            actions = policy.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
             loss, _ = policy.generator.loss(
-                policy.core, context, actions, batch.valid, torch.Generator().manual_seed(trainer.step)
+                policy.core,
+                context,
+                policy.targets(batch),
+                batch.valid,
+                torch.Generator().manual_seed(trainer.step),
             )
             loss = loss.mean()
     spent["core"] -= spent.pop("derivative", 0.0)

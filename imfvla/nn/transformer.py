@@ -85,6 +85,14 @@ class Block(nn.Module):
         history.add(self.mlp(self.mlp_norm(history.read())))
 
 
+@torch.no_grad()
+def copy_weights(source: nn.Module, target: nn.Module) -> None:
+    """The parameters of `target` take the values of those of `source` with the same names."""
+    learned = dict(source.named_parameters())
+    for name, parameter in target.named_parameters():
+        parameter.copy_(learned[name])
+
+
 class TransformerCore(nn.Module):
     """Maps a noisy sequence, its times and a context to a sequence: (x, t, r | context) -> (B, H, A).
 
@@ -154,12 +162,9 @@ class TransformerCore(nn.Module):
         """What the blocks of the instantaneous velocity say, r = t: x (B, H, A), t (B,) -> (B, H, A)."""
         return self.sequence(self.output(self.features(x, t, t, context)))
 
-    @torch.no_grad()
     def start_average(self) -> None:
         """The blocks of the average velocity take the weights of those of the instantaneous one."""
-        learned = dict(self.named_parameters())
-        for name, parameter in self.average.named_parameters():
-            parameter.copy_(learned[name])
+        copy_weights(self, self.average)
 
     def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
         """What the output layers read of each action token: (B, K, D)."""

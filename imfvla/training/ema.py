@@ -34,7 +34,7 @@ class Ema:
         pairs = list(zip(self.policy.parameters(), self._source.parameters(), self._first_steps, strict=True))
         for first in set(self._first_steps):
             if step >= first:
-                averages, currents = zip(*((a, c) for a, c, begun in pairs if begun == first), strict=True)
+                averages, currents = zip(*((a, c) for a, c, start in pairs if start == first), strict=True)
                 torch._foreach_lerp_(averages, currents, 1 - decay_at(step - first, self.limit))
         for averaged, current in zip(self.policy.buffers(), self._source.buffers(), strict=True):
             averaged.copy_(current)
