@@ -1,0 +1,65 @@
+"""What a rollout needs of a world. dm_control tasks, Gymnasium environments and the tests' fakes implement it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from imfvla.robot import RobotSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one control step led to."""
+
+    reward: float
+    stage: int  # the highest stage that holds now, 0 for none; always 0 where a task has no stages
+    success: bool  # whether the episode counts as a success so far
+    ended: bool  # whether the world ends the episode here, at its time limit or before
+
+
+class Environment(Protocol):
+    """A world with one robot. A policy sees it through `state`, `look` and `instruction` alone.
+
+    stages: their names in order, empty where success is a yes or no. instruction and paraphrases: of the episode that
+    was reset last. goal: the task of that episode where one scene serves several, else None.
+    """
+
+    robot: RobotSpec
+    name: str
+    instruction: str
+    paraphrases: tuple[str, ...]
+    goal: str | None
+    stages: tuple[str, ...]
+    time_limit_steps: int
+    views: tuple[str, ...]  # cameras that `look` shows, in this order
+
+    def reset(self, seed: int) -> None:
+        """Starts the episode that `seed` determines."""
+        ...
+
+    def state(self) -> np.ndarray:
+        """The state channels of `robot` now: float32 (S,)."""
+        ...
+
+    def look(self) -> dict[str, np.ndarray]:
+        """A picture of each of `views`: uint8 (H, W, 3) of its camera's size. Renders only when called."""
+        ...
+
+    def render(self, view: str, height: int, width: int) -> np.ndarray:
+        """One camera at any size, for videos: uint8 (height, width, 3)."""
+        ...
+
+    def step(self, action: np.ndarray) -> Outcome:
+        """Applies one action (A,) for one control step."""
+        ...
+
+    def start_digest(self) -> str:
+        """16 hex digits that name the start state of this episode: equal digits, equal starts."""
+        ...
+
+    def renderer(self) -> str:
+        """What draws its pictures, such as "llvmpipe (LLVM 15.0.6, 256 bits)"; it decides which rows may be mixed."""
+        ...
+
+    def close(self) -> None: ...
