@@ -45,12 +45,11 @@ class Policy(nn.Module):
         """(Tp, A) of the noise that one prediction starts from."""
         return self.horizon.pred, self.action_dim
 
-    def first_steps(self, steps: int) -> dict[str, int]:
-        """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
-        if not hasattr(self.generator, "first_steps"):
+    def spans(self, steps: int) -> dict[str, tuple[float, float]]:
+        """Of parameters that do not learn in all of `steps` steps, the steps [first, end) in which they do, by name."""
+        if not hasattr(self.generator, "span"):
             return {}
-        later = self.generator.first_steps(self.core, steps)
-        return {f"core.{name}": step for name, step in later.items()}
+        return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
 
     def begin_step(self, step: int, steps: int) -> None:
         """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""

@@ -184,14 +184,20 @@ def train(
 ) -> nn.Module:
     """The averaged weights of a core that `generator` has trained; calls `advance` after each step."""
     torch.manual_seed(seed)
+    staged = hasattr(generator, "span")
     core = PlaneCore(width, depth, velocity_head=generator.core_interface == "flow and v-head")
-    ema = Ema(core, 0.999)
-    optimiser = torch.optim.Adam(core.parameters(), RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    learned = dict(core.named_parameters())
+    spans = {name: generator.span(f"core.{name}", steps) if staged else (0, steps) for name in learned}
+    ema = Ema(core, 0.999, spans)
+    optimiser = torch.optim.Adam([{"params": [learned[name]], "span": span} for name, span in spans.items()])
     rng = torch.Generator().manual_seed(seed)
     valid = torch.ones(BATCH, 1, dtype=torch.bool)
     for step in range(steps):
-        if hasattr(generator, "begin_step"):
+        for group in optimiser.param_groups:
+            first, end = group["span"]
+            group["lr"] = RATE * (1 + math.cos(math.pi * (step - first) / (end - first))) / 2
+        ema.settle(step)
+        if staged:
             for learner in (core, ema.policy):
                 generator.begin_step(learner, step, steps)
         loss, _ = generator.loss(core, NoContext(), draw(BATCH, rng).unsqueeze(1), valid, rng)
@@ -199,7 +205,6 @@ def train(
         loss.mean().backward()
         nn.utils.clip_grad_norm_(core.parameters(), 1.0)
         optimiser.step()
-        schedule.step()
         ema.update(step)
         advance()
     return ema.policy
