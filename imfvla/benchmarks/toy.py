@@ -145,18 +145,18 @@ def flipped(generator: Any) -> Any:
 
 GENERATORS: dict[str, Callable[[], Any]] = {
     "imf": lambda: shipped("imf"),
-    "imf, sign flipped": lambda: flipped(shipped("imf")),
-    "imf_staged": lambda: shipped("imf_staged"),
+    "imf_plain": lambda: shipped("imf_plain"),
+    "imf_plain, sign flipped": lambda: flipped(shipped("imf_plain")),
     "flow_high_noise": lambda: shipped("flow_high_noise"),
     "ddpm": lambda: shipped("ddpm"),
 }
 CASES = (  # generator, evaluations, whether it has to pass
     ("imf", 1, True),
-    ("imf_staged", 1, True),
+    ("imf_plain", 1, True),
     ("flow_high_noise", 100, True),
     ("ddpm", 100, True),
     ("flow_high_noise", 1, False),
-    ("imf, sign flipped", 1, False),
+    ("imf_plain, sign flipped", 1, False),
 )
 
 

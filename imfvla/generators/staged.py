@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.errors import UserError
 from imfvla.generators.base import masked_error
 from imfvla.generators.velocity import AverageVelocity, interpolate
 from imfvla.options import SHARE_BELOW_1, at_least, one_of
@@ -46,7 +47,7 @@ class StagedMeanFlow(AverageVelocity):
         super().__init__(draws=draws, compound_draws=draws, **options)
         assert velocity_head
         self.average_from, self.path_steps = average_from, path_steps
-        self.learns_average = False
+        self.learns_average: bool | None = None  # None: not told of a step yet
 
     def span(self, name: str, steps: int) -> tuple[float, float]:
         """The steps [first, end) of `steps` in which the parameter `name` of a policy learns."""
@@ -59,6 +60,15 @@ class StagedMeanFlow(AverageVelocity):
         if step == first:
             core.start_average()
         self.learns_average = step >= first
+
+    def check_nfe(self, nfe: int) -> None:
+        """Any number of steps is possible, one with weights from the second stage alone."""
+        super().check_nfe(nfe)
+        if self.learns_average is False and (nfe == 1 or self.boundary_share < 1):
+            raise UserError(
+                f"nfe={nfe} follows the average velocity, which these weights do not have yet: it is learned in the "
+                f"last {1 - self.average_from:.0%} of the training. Take later weights, or more steps."
+            )
 
     def _first_step(self, steps: int) -> int:
         return round(self.average_from * steps)

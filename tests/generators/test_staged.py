@@ -164,6 +164,19 @@ def test_more_steps_than_one_follow_v_where_the_average_is_of_the_whole_interval
     "change", ["average_from=1.0", "average_from=-0.1", "path_steps=0", "velocity_head=false"]
 )
 def test_impossible_choices_are_refused_by_name(change):
-    config = compose("train", ["generator=imf_staged", f"generator.{change}"])
+    config = compose("train", ["generator=imf", f"generator.{change}"])
     with pytest.raises(UserError, match=rf"generator\.{change.split('=')[0]}"):
         construct(config["generator"], "generator")
+
+
+def test_one_step_needs_weights_of_the_second_stage():
+    gen = generator(boundary_share=1.0, average_from=0.75)
+    gen.check_nfe(1)
+    gen.begin_step(Core(), 1, 4)
+    gen.check_nfe(2)
+    with pytest.raises(
+        UserError, match=r"nfe=1 follows the average velocity.* in the last 25%.*checkpoint=last"
+    ):
+        gen.check_nfe(1)
+    gen.begin_step(Core(), 3, 4)
+    gen.check_nfe(1)
