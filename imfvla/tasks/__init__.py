@@ -1,18 +1,18 @@
 """RoboIMI's two bimanual tasks in dm_control, and both in one scene.
 
-Importing this package picks the GL backend and does nothing else.
+Importing this package has the GL backend picked before mujoco is imported, and does nothing else.
 """
 
 from typing import TYPE_CHECKING
 
 from imfvla.errors import UserError
-from imfvla.gl import select_gl_backend
+from imfvla.gl import select_before_simulators
 from imfvla.tasks.texts import TEXTS, text_for
 
 if TYPE_CHECKING:
     from imfvla.tasks.bimanual import BimanualEnvironment
 
-select_gl_backend()  # before anything imports mujoco
+select_before_simulators()
 
 NAMES = (*TEXTS, "combined")
 VARIANTS = ("easy", "default", "hard")
@@ -44,7 +44,7 @@ def load(
         raise UserError(f"There is no task {name!r}; choose one of {', '.join(sorted(NAMES))}.")
     if variant not in VARIANTS:
         raise UserError(f"task.variant must be one of {', '.join(VARIANTS)}, found {variant!r}.")
-    # mujoco is imported here: after the backend is chosen, and only by code that simulates.
+    # mujoco is imported here, only by code that simulates.
     from imfvla.tasks.bimanual import BimanualEnvironment
     from imfvla.tasks.combined import CombinedTask
     from imfvla.tasks.socket import SocketTask
