@@ -14,7 +14,7 @@ from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
-from imfvla.options import Limit, build, part_of, within
+from imfvla.options import Limit, build, one_of, part_of, within
 from imfvla.progress import Progress
 from imfvla.protocol import MAX_WORKERS
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
@@ -42,6 +42,7 @@ class DemoOptions:
     frames_directory: Annotated[str, NOT_EMPTY] | None  # of the frame store, see imfvla.training.data
     camera_every: Annotated[int, within(1, MAX_CAMERA_EVERY)]
     workers: Annotated[int, within(0, MAX_WORKERS)] | None
+    source: Annotated[str, one_of("scripted")] = "scripted"  # of imfvla.sources.opening
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.collection import check_demonstrations, ensure_demonstrations
+from imfvla.collection import check_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
@@ -20,8 +20,10 @@ from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
 from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.table_row import print_row
+from imfvla.robot_of import robot_of, with_robot
 from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
-from imfvla.training.data import make_loader, prepare_windows
+from imfvla.sources.opening import SCRIPTED, kind_of, open_source
+from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import Alone, joined_processes
@@ -40,9 +42,10 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     options = read_options(config)
     training, optim, evaluation = options.training, options.optim, options.evaluation
     is_trained = training.steps in run.weight_steps()
+    config = with_robot(config)
     policy = rehearse(config, evaluation.nfe, evaluation.noise_scale)
     if not is_trained:
-        check_demonstrations(config)
+        _check_source(config)
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
@@ -55,6 +58,14 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
             _run_stages(config, run, training, optim, evaluation, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, run, training, optim, processes)
+
+
+def _check_source(config: Mapping[str, Any]) -> None:
+    """Raises UserError where the episodes to learn from cannot be had, or are of another robot; records none."""
+    if kind_of(config) == SCRIPTED:
+        check_demonstrations(config)
+    else:
+        refuse_other_source(config, open_source(config))
 
 
 def _run_stages(
@@ -98,12 +109,12 @@ def _train(
 ) -> None:
     if processes.is_first:
         run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
-        windows = prepare_windows(config, ensure_demonstrations(config))
+        windows = prepare_windows(config, open_source(config))
         run.write_status(RUNNING, phase="training", pid=os.getpid())
         processes.wait()
     else:
         processes.wait()  # for demonstrations and frame store, which exist by then
-        windows = prepare_windows(config, ensure_demonstrations(config))
+        windows = prepare_windows(config, open_source(config))
     seed = config["seed"]
     initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
@@ -123,6 +134,7 @@ def _train(
             "name": config["name"],
             "seed": seed,
             "num_parameters": num_parameters,
+            "robot": robot_of(config).to_json(),
             "config_digest": config_digest(config, EXECUTION_KEYS),
         },
         processes=processes,

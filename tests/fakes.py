@@ -1,7 +1,7 @@
 """An environment and a policy whose every answer is known: rollouts without simulator and training."""
 
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,9 +12,21 @@ from torch import Tensor
 
 from imfvla.episode import ACTION_DIM, STATE_DIM
 from imfvla.horizon import Horizon
+from imfvla.robot import RobotSpec
+from imfvla.tasks.bimanual_robot import bimanual_robot
 from imfvla.types import Observation
 
 LIMIT = 4.0  # of every action
+
+
+VIEWS, IMAGE_SIZE = ("front", "top"), (16, 16)
+
+
+def fake_robot(views: tuple[str, ...] = VIEWS, image_size: tuple[int, int] = IMAGE_SIZE) -> RobotSpec:
+    """The two arms, with wider limits than theirs."""
+    limits = (LIMIT,) * ACTION_DIM
+    wide = {"action_min": tuple(-limit for limit in limits), "action_max": limits}
+    return replace(bimanual_robot(views, image_size), **wide)
 
 
 def known_actions(num_steps: int) -> np.ndarray:
@@ -29,17 +41,14 @@ class FakeEnvironment(StillScene):
     num_stages, success_stage = 3, 3
 
     def __init__(self, time_limit_steps: int = 40, ends_at: int | None = None) -> None:
-        super().__init__(views=("front", "top"), image_size=(16, 16))
+        super().__init__(views=VIEWS, image_size=IMAGE_SIZE)
+        self.robot = fake_robot()
         context = SimpleNamespace(call=lambda function: "no renderer")
         self.physics.contexts = SimpleNamespace(gl=SimpleNamespace(make_current=lambda: nullcontext(context)))
         self.time_limit_steps = time_limit_steps
         self._ends_at = ends_at or time_limit_steps
         self.executed: list[np.ndarray] = []
         self.looked: list[int] = []
-
-    def action_spec(self) -> SimpleNamespace:
-        shape = (ACTION_DIM,)
-        return SimpleNamespace(shape=shape, minimum=np.full(shape, -LIMIT), maximum=np.full(shape, LIMIT))
 
     def reset(self, seed: int) -> SimpleNamespace:
         self._seed, self._step, self.position = seed, 0, 0.0
@@ -81,8 +90,10 @@ class KnownPolicy:
     horizon: Horizon
     actions: np.ndarray
     noise_scale: float = 0.0
+    views, image_size = VIEWS, IMAGE_SIZE
 
     def __post_init__(self) -> None:
+        self.robot = fake_robot()
         self.seen: list[np.ndarray] = []
         self.noises: list[np.ndarray] = []
         self.evaluations: list[int] = []

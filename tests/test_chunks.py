@@ -5,8 +5,10 @@ import torch
 from imfvla.chunks import MIN_SCALE, ChunkFrame
 from imfvla.errors import UserError
 from imfvla.statistics import Statistics
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
 STEPS, CHANNELS = 4, 16
+ARMS = bimanual_robot((), (8, 8))
 
 
 def example(rows=200):
@@ -20,7 +22,7 @@ def example(rows=200):
 
 def fitted(frame):
     state, action, statistics = example()
-    made = ChunkFrame(frame, STEPS, CHANNELS)
+    made = ChunkFrame(frame, STEPS, ARMS)
     made.fit(statistics)
     return made, state, action
 
@@ -59,7 +61,7 @@ def test_still_channels_are_not_blown_up():
     still = Statistics.of(
         state.numpy(), state.numpy(), np.zeros(action.shape), np.ones(action.shape[:2], bool)
     )
-    made = ChunkFrame("relative", STEPS, CHANNELS)
+    made = ChunkFrame("relative", STEPS, ARMS)
     made.fit(still)
     assert made.normaliser.scale[:, 0].tolist() == pytest.approx([MIN_SCALE] * STEPS)
 
@@ -80,4 +82,4 @@ def test_steps_that_are_not_valid_leave_the_statistics_alone():
 
 def test_an_unknown_frame_is_refused():
     with pytest.raises(UserError, match="action_frame must be relative or absolute, found 'polar'"):
-        ChunkFrame("polar", STEPS, CHANNELS)
+        ChunkFrame("polar", STEPS, ARMS)

@@ -17,6 +17,7 @@ from imfvla.completion import is_complete
 from imfvla.entry import entry_point, output_directory
 from imfvla.errors import UserError
 from imfvla.run_directory import RunDirectory
+from imfvla.sources.mcap import McapSource
 
 OVERRIDES = [
     "observation.image_size=[32,32]",
@@ -53,7 +54,6 @@ def launch(arguments: list[str], directory: Path, **environment: str) -> subproc
 def main(config: dict[str, Any]) -> None:
     from imfvla import experiment
     from imfvla.evaluation import evaluate
-    from imfvla.recording import Recordings
 
     if config["seed"] == 13:
         raise UserError("seed 13 is bad.")
@@ -70,7 +70,7 @@ def main(config: dict[str, Any]) -> None:
 
     with (
         mock.patch.object(
-            experiment, "ensure_demonstrations", lambda config: Recordings.of(config["demos"]["directory"])
+            experiment, "open_source", lambda config: McapSource.of(config["demos"]["directory"])
         ),
         mock.patch.object(
             experiment,
@@ -91,7 +91,9 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
 
     env = FakeEnvironment()
     env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
-    return env, load_policy(RunDirectory(run), step)
+    policy = load_policy(RunDirectory(run), step)
+    env.robot = policy.robot
+    return env, policy
 
 
 def untimed_table(directory: Path) -> list[dict[str, str]]:

@@ -10,6 +10,7 @@ from imfvla.data.frame_store import FrameStore
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
+from imfvla.robot import RobotSpec
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -19,17 +20,20 @@ class Windows:
 
     A step is a decision if every step that `Horizon.observed_steps` names for it has frames. With `obs=1`
     these are all steps with frames. With `obs>=2` a rollout sees consecutive control steps, so the
-    recordings must have frames at every step (`camera_every=1`), or where a policy of the same horizon
-    saw them; recordings with gaps would leave only the first step of each episode and are refused with a
+    episodes must have frames at every step (`camera_every=1`), or where a policy of the same horizon
+    saw them; episodes with gaps would leave only the first step of each episode and are refused with a
     UserError.
 
     With `paraphrases` an item's sentence is drawn from the recorded one and its paraphrases, otherwise it is the
     recorded one.
     """
 
-    def __init__(self, store: FrameStore, horizon: Horizon, *, paraphrases: bool = True) -> None:
+    def __init__(
+        self, store: FrameStore, horizon: Horizon, robot: RobotSpec, *, paraphrases: bool = True
+    ) -> None:
         self.store = store
         self.horizon = horizon
+        self.robot = robot
         self._index_windows()
         self._index_instructions(paraphrases)
 
@@ -51,14 +55,15 @@ class Windows:
         return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
 
     def describe(self, indices: np.ndarray) -> list[str]:
-        """Episode file and decision step of each window."""
-        files = [self.store.episodes[number].file for number in self.episodes[indices]]
-        return [f"{file}, step {step}" for file, step in zip(files, self.steps[indices], strict=True)]
+        """Episode and decision step of each window."""
+        names = [self.store.episodes[number].name for number in self.episodes[indices]]
+        return [f"{name}, step {step}" for name, step in zip(names, self.steps[indices], strict=True)]
 
     def statistics(self) -> Statistics:
         """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
         store = self.store
-        displacement = store.action[self._followed] - store.state[self._observed[:, -1:]]
+        decided_at = store.state[self._observed[:, -1:]]
+        displacement = store.action[self._followed] - decided_at[..., self.robot.origin]
         return Statistics.of(store.state, store.action, displacement, self._valid)
 
     def _index_windows(self) -> None:
@@ -80,7 +85,7 @@ class Windows:
         if not steps or (self.horizon.obs > 1 and not any(steps)):
             raise UserError(
                 f"horizon.obs={self.horizon.obs} needs frames at that many consecutive control steps, and "
-                f"the recordings in {self.store.path} have none: collect with camera_every=1, or set "
+                f"the episodes in {self.store.path} have none: collect with camera_every=1, or set "
                 "horizon.obs=1."
             )
         self.episodes = np.array(episodes)  # (W,)  number of the episode in the store

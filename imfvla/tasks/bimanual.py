@@ -14,6 +14,7 @@ from dm_env import specs
 from imfvla.episode import ACTION_DIM, ACTION_NAMES, CONTROL_HZ, STATE_DIM
 from imfvla.errors import UserError
 from imfvla.options import build
+from imfvla.tasks.bimanual_robot import bimanual_robot
 from imfvla.tasks.props import Prop
 from imfvla.tasks.robot import FINGER_TRAVEL, home_joints
 from imfvla.tasks.scene import CAMERAS, PHYSICS_TIMESTEP_S, Scene
@@ -216,6 +217,7 @@ class BimanualEnvironment(composer.Environment):
     ) -> None:
         _check_views(views)
         seen = build(ViewOptions, {"views": views, "image_size": image_size}, "observation")
+        self.robot = bimanual_robot(seen.views, seen.image_size)
         self.views, self.image_size = seen.views, seen.image_size
         self._seeds = np.random.RandomState(seed)
         self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
