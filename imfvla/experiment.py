@@ -1,4 +1,4 @@
-"""An experiment from nothing to its row of the table: collect, train, evaluate. A rerun resumes it."""
+"""An experiment from nothing to its row of the table: collect or open data, train, evaluate. A rerun resumes it."""
 
 import logging
 import os
@@ -12,15 +12,19 @@ import torch
 
 from imfvla.collection import check_demonstrations
 from imfvla.composition import EXECUTION_KEYS
+from imfvla.data.held_out import held_out
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.gl import select_gl_backend
 from imfvla.nn.pretrained import initialise_from_pretrained
+from imfvla.offline import evaluate_offline
+from imfvla.options import require
 from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
 from imfvla.rehearsal import read_options, rehearse
+from imfvla.reporting.offline import print_offline
 from imfvla.reporting.table_row import print_row
-from imfvla.robot_of import robot_of, with_robot
+from imfvla.robot_of import has_environment, robot_of, with_robot
 from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
 from imfvla.sources.opening import SCRIPTED, kind_of, open_source
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
@@ -34,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
-    """Does the remaining work of the experiment in `run` and prints its row.
+    """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
 
     `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
     traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
@@ -49,7 +53,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
-    if run.status().get("state") != DONE:
+    if has_environment(config) and run.status().get("state") != DONE:
         select_gl_backend()  # without one, training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
         if not is_trained:
@@ -63,9 +67,14 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
 def _check_source(config: Mapping[str, Any]) -> None:
     """Raises UserError where the episodes to learn from cannot be had, or are of another robot; records none."""
     if kind_of(config) == SCRIPTED:
+        require(
+            has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED
+        )
         check_demonstrations(config)
-    else:
-        refuse_other_source(config, open_source(config))
+        return
+    source = open_source(config)
+    refuse_other_source(config, source)
+    held_out(config["task"], len(source))
 
 
 def _run_stages(
@@ -87,7 +96,10 @@ def _run_stages(
             else:
                 _train(config, run, training, optim, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
-            evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+            if has_environment(config):
+                evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+            else:
+                evaluate_offline(run, config, evaluation)
             if run.status().get("state") != DONE:
                 run.write_status(DONE)
         except KeyboardInterrupt:
@@ -97,7 +109,10 @@ def _run_stages(
             with suppress(UserError):  # a full disk must not hide the error
                 run.write_status(FAILED, error=str(error), traceback=traceback.format_exc())
             raise
-    print_row(run)
+    if has_environment(config):
+        print_row(run)
+    else:
+        print_offline(run)
 
 
 def _train(

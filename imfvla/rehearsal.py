@@ -16,7 +16,7 @@ from imfvla.instruction import MAX_WORDS
 from imfvla.options import build, one_of, part_of, require, within
 from imfvla.policy import Policy, build_policy
 from imfvla.protocol import MAX_SEED, USUAL_NOISE, EvaluationOptions
-from imfvla.robot_of import view_options
+from imfvla.robot_of import has_environment, view_options
 from imfvla.run_directory import step_of
 from imfvla.training.loop import choose_device
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -47,6 +47,8 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
     build(Horizon, part_of(config, "horizon"), "horizon")
     build(Augmentation, part_of(config, "augmentation"), "augmentation")
     view_options(config)
+    if not has_environment(config):
+        part_of(config, "task.held_out")
     paraphrases = part_of(config, "task.paraphrases")
     require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
     training = build(TrainingOptions, part_of(config, "training"), "training")

@@ -31,7 +31,8 @@ def with_robot(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def has_environment(config: Mapping[str, Any]) -> bool:
     """Whether policies are rolled out at the end, rather than judged on held-out episodes."""
-    return part_of(config, "task.name") != NO_ENVIRONMENT
+    task = config.get("task")
+    return not isinstance(task, Mapping) or task.get("name") != NO_ENVIRONMENT
 
 
 def view_options(config: Mapping[str, Any]) -> ViewOptions:

@@ -107,7 +107,7 @@ MAY_IMPORT = {
     },
     "tasks": {"mujoco", "dm_control", "episode", "gl", "options", "robot", "views"},
     "recording": {"documents", "episode", "files"},
-    "reporting": {"documents", "episode", "files", "options", "protocol", "run_directory"},
+    "reporting": {"documents", "episode", "files", "options", "protocol", "robot", "run_directory"},
     "figures": {"documents", "reporting", "robot_of"},
     "sources": {"collection", "episode", "options", "recording", "robot", "same_robot", "tasks"},
     "modes": {
@@ -130,6 +130,7 @@ MAY_IMPORT = {
         "files",
         "horizon",
         "instruction",
+        "options",
         "resample",
         "robot",
         "sources",

@@ -22,7 +22,7 @@ from imfvla.errors import UserError
 from imfvla.files import locked, write_remedy
 from imfvla.resample import resample
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
-from imfvla.sources.checking import check_episode
+from imfvla.sources.validation import check_episode
 
 FORMAT = 2
 IMAGES = "images.raw"

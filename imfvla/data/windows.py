@@ -3,6 +3,8 @@
 Shapes: B batch, W windows, To observed steps, Tp predicted steps, V views, L instruction words.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 
@@ -25,13 +27,20 @@ class Windows:
     UserError.
 
     With `paraphrases` an item's sentence is drawn from the recorded one and its paraphrases, otherwise it is the
-    recorded one.
+    recorded one. `episodes` are those of the store that count, by number; None for all.
     """
 
     def __init__(
-        self, store: FrameStore, horizon: Horizon, robot: RobotSpec, *, paraphrases: bool = True
+        self,
+        store: FrameStore,
+        horizon: Horizon,
+        robot: RobotSpec,
+        *,
+        paraphrases: bool = True,
+        episodes: Collection[int] | None = None,
     ) -> None:
         self.store = store
+        self.chosen = range(len(store.episodes)) if episodes is None else sorted(episodes)
         self.horizon = horizon
         self.robot = robot
         self._index_windows()
@@ -54,6 +63,11 @@ class Windows:
         actions = torch.from_numpy(self.store.action[self._followed[indices]])
         return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
 
+    def decided(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Without pictures: states (B, S) at the decisions `indices`, actions (B, Tp, A) and valid (B, Tp)."""
+        state = self.store.state[self._observed[indices, -1]]
+        return state, self.store.action[self._followed[indices]], self._valid[indices]
+
     def describe(self, indices: np.ndarray) -> list[str]:
         """Episode and decision step of each window."""
         names = [self.store.episodes[number].name for number in self.episodes[indices]]
@@ -61,14 +75,22 @@ class Windows:
 
     def statistics(self) -> Statistics:
         """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
-        store = self.store
+        store, rows = self.store, self._rows()
         decided_at = store.state[self._observed[:, -1:]]
         displacement = store.action[self._followed] - decided_at[..., self.robot.origin]
-        return Statistics.of(store.state, store.action, displacement, self._valid)
+        return Statistics.of(store.state[rows], store.action[rows], displacement, self._valid)
+
+    def _rows(self) -> np.ndarray | slice:
+        """The rows of the store's states and actions that belong to the chosen episodes."""
+        if len(self.chosen) == len(self.store.episodes):
+            return slice(None)
+        chosen = [self.store.episodes[number] for number in self.chosen]
+        return np.concatenate([np.arange(one.num_steps) + one.first_row for one in chosen])
 
     def _index_windows(self) -> None:
         episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []
-        for number, episode in enumerate(self.store.episodes):
+        for number in self.chosen:
+            episode = self.store.episodes[number]
             frame_at = np.full(episode.num_steps, -1)
             frame_at[episode.image_steps] = episode.first_frame + np.arange(len(episode.image_steps))
             for step in episode.image_steps:

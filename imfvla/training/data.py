@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
+from imfvla.data.held_out import held_out
 from imfvla.horizon import Horizon
 from imfvla.options import build
 from imfvla.progress import Progress
@@ -34,8 +35,16 @@ def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows
             observation["views"],
             progress=progress,
         )
+    kept = held_out(config["task"], len(source))
     horizon = build(Horizon, config["horizon"], "horizon")
-    return Windows(store, horizon, robot, paraphrases=config["task"]["paraphrases"])
+    trained = set(range(len(source))) - set(kept)
+    return Windows(store, horizon, robot, paraphrases=config["task"]["paraphrases"], episodes=trained)
+
+
+def held_out_windows(windows: Windows) -> Windows:
+    """The decisions of the episodes that training windows leave out, with the recorded sentences."""
+    others = set(range(len(windows.store.episodes))) - set(windows.chosen)
+    return Windows(windows.store, windows.horizon, windows.robot, paraphrases=False, episodes=others)
 
 
 def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> None:
