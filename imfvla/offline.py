@@ -34,10 +34,10 @@ def evaluate_offline(
 ) -> dict[str, Any]:
     """The content of `offline.json` in the run directory, which is written unless it is there already.
 
-    `config` is the run's, and says where its data lies. For chunks of each of `options.nfe`, for holding still and for the actions of the
-    nearest training decision: the mean absolute error (Tp, A) in the units of the channels, over the held-out
-    decisions; steps past an episode's end do not count, and are null where none counts. Raises UserError where there
-    are no such weights.
+    `config` is the run's, and says where its data lies. For chunks of each of `options.nfe`, for holding still and for
+    the actions of the nearest training decision: the mean absolute error (Tp, A) in the units of the channels, over the
+    held-out decisions; steps past an episode's end do not count, and are null where none counts. Raises UserError where
+    there are no such weights.
     """
     windows = prepare_windows(config, open_source(config))
     unseen = held_out_windows(windows)

@@ -103,9 +103,9 @@ def offline_table(runs: Sequence[tuple[str, dict[str, Any]]]) -> Document:
     )
     note = (
         "Mean absolute error of chunks over their executed steps and all channels, against what was done in episodes "
-        "that training did not see, in standard deviations of the training actions. Hold still keeps the present state; "
-        "nearest demonstration takes the actions that followed the most similar training state. A small error is no "
-        "success: no environment was played."
+        "that training did not see, in standard deviations of the training actions. Hold still keeps the present "
+        "state; nearest demonstration takes the actions that followed the most similar training state. A small error "
+        "is no success: no environment was played."
     )
     table = Table("Offline evaluations", columns, tuple(cells), (note,), tuple(keys))
     return Document(table, Table(table.title, columns, table.rows))
