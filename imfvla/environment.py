@@ -72,3 +72,9 @@ class Bodies(Protocol):
 
     model: Any
     data: Any
+
+
+def bodies_of(env: Environment) -> Bodies | None:
+    """What an environment shows in 3D now; None where it has no simulator's bodies."""
+    scene = getattr(env, "scene", None)
+    return None if scene is None else scene()

@@ -9,7 +9,7 @@ import numpy as np
 
 from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.collection import collect
-from imfvla.environment import Environment
+from imfvla.environment import Environment, bodies_of
 from imfvla.recording import Recordings
 
 MEASURE_S = 1.0  # seconds of each rate
@@ -24,7 +24,7 @@ def measure_simulation(env: Environment) -> dict[str, float]:
     env.reset(0)
     hold = _rest(env)
     control = rate(lambda: _step(env, hold), MEASURE_S)
-    simulator = env.scene() if hasattr(env, "scene") else None
+    simulator = bodies_of(env)
     physics = {"physics_steps_per_s": rate(simulator.step, MEASURE_S)} if hasattr(simulator, "step") else {}
     cameras = [env.robot.camera(view) for view in env.views]
     frames = times_ms([partial(env.render, c.name, c.height, c.width) for c in cameras], FRAMES)

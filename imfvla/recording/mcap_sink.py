@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from imfvla.environment import Bodies, Environment
+from imfvla.environment import Environment, bodies_of
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.files import write_remedy
@@ -72,7 +72,7 @@ class McapSink:
             )
             self._sizes = {camera.name: (camera.height, camera.width) for camera in info.robot.cameras}
             self._transforms_every = max(1, round(info.robot.control_hz / TRANSFORMS_HZ))
-            bodies = _bodies(env)
+            bodies = bodies_of(env)
             self._bodies = [] if bodies is None else body_names(bodies.model)
             self._scene = None if bodies is None else scene_update(bodies.model)
             self._see(env, 0)
@@ -120,7 +120,7 @@ class McapSink:
 
     def _see(self, env: Environment, next_step: int) -> None:
         """Keeps the current frames and poses for the next step, if that step is recorded."""
-        bodies = _bodies(env) if next_step % self._transforms_every == 0 else None
+        bodies = bodies_of(env) if next_step % self._transforms_every == 0 else None
         self._transforms = None if bodies is None else frame_transforms(self._bodies, bodies.data)
         self._frames = env.look() if self._render_every and next_step % self._render_every == 0 else {}
 
@@ -179,12 +179,6 @@ class McapSink:
         except BaseException:
             self.abort()
             raise
-
-
-def _bodies(env: Environment) -> Bodies | None:
-    """What an environment with a simulator shows in 3D."""
-    scene = getattr(env, "scene", None)
-    return None if scene is None else scene()
 
 
 def _size(shape: tuple[int, int]) -> str:
