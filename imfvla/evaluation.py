@@ -18,7 +18,7 @@ from imfvla.run_directory import RunDirectory, flatten
 from imfvla.workbench import Build, Job, describe_world, load_workbench, record, roll_out
 from imfvla.workers import Here, Pool, worker_pool
 
-REQUIRED_KEYS = ("name", "task.name")  # the environment reads its own
+REQUIRED_KEYS = ("name", "task.name", "observation.views", "observation.image_size")
 USUAL_VARIANT = "default"  # of a task that has no other
 
 

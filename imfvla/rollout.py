@@ -9,6 +9,7 @@ import numpy as np
 
 from imfvla.environment import Environment, Outcome
 from imfvla.episode import Actor, EpisodeInfo, EpisodeResult, Sink, Step
+from imfvla.errors import UserError
 
 NON_FINITE = "non-finite action"
 FAR_OUT_OF_RANGE = "action far out of range"
@@ -39,7 +40,7 @@ def run_episode(
 
     An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row
     keeps the reward collected so far, carries the label and counts as no success. Any other exception
-    aborts the sinks and is re-raised.
+    aborts the sinks and is re-raised. UserError where the environment does not do what its robot says.
 
     Args:
       env: any world; its `robot` says how much time a control step takes.
@@ -56,6 +57,7 @@ def run_episode(
       empty where the task has no stages.
     """
     env.reset(seed)
+    _refuse_misfit(env)
     start_digest = env.start_digest()
     actor.reset(env, seed)
     done = getattr(actor, "done", None)
@@ -127,3 +129,15 @@ def run_episode(
             sink.end(result)
         aborts.pop_all()
     return result
+
+
+def _refuse_misfit(env: Environment) -> None:
+    """Raises UserError where what an environment shows is not what its robot says."""
+    for view in env.views:
+        env.robot.camera(view)
+    state, wanted = np.asarray(env.state()), len(env.robot.state)
+    if state.shape != (wanted,):
+        raise UserError(
+            f"The environment {env.name} does not fit its robot: state() must be {wanted} numbers, as the robot has "
+            f"state channels, found an array of shape {state.shape}; correct one of them."
+        )

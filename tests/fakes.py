@@ -125,8 +125,11 @@ class KnownPolicy:
     horizon: Horizon
     actions: np.ndarray
     noise_scale: float = 0.0
+    robot: RobotSpec = ROBOT
 
     def __post_init__(self) -> None:
+        self.views = tuple(camera.name for camera in self.robot.cameras)
+        self.image_size = (self.robot.cameras[0].height, self.robot.cameras[0].width)
         self.seen: list[np.ndarray] = []
         self.noises: list[np.ndarray] = []
         self.evaluations: list[int] = []
