@@ -5,12 +5,12 @@ Shapes: To observed steps, V views, H W pixels, S state, Tp predicted steps, A a
 
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 
 from imfvla.ensemble import TemporalEnsemble
+from imfvla.environment import Environment
 from imfvla.episode import Decision
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
@@ -50,7 +50,7 @@ class ChunkActor:
         self._noise_seed, self._noise_scale = noise_seed, noise_scale
         self._device = torch.device(device)
 
-    def reset(self, env: Any, seed: int) -> None:
+    def reset(self, env: Environment, seed: int) -> None:
         """Forgets the last episode. `env` has the instruction, and the robot with the limits of its actions.
 
         Raises UserError where that is another robot than the policy's.
@@ -72,7 +72,7 @@ class ChunkActor:
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
         """The action of `step`; looks and replans where the horizon says so.
 
         Raises:

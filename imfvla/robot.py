@@ -63,6 +63,14 @@ class RobotSpec:
             require(
                 not repeated, f"robot.{key}", "names that all differ", f"{', '.join(repeated)} more than once"
             )
+            groups = {name[:place] for name in plain for place, sign in enumerate(name) if sign == "/"}
+            shared = sorted(groups & set(plain))
+            require(
+                not shared,
+                f"robot.{key}",
+                "channels that are no group of others",
+                f"{', '.join(shared)} as both",
+            )
         for key in ("relative_to", "action_min", "action_max"):
             count = len(getattr(self, key))
             require(
@@ -132,7 +140,7 @@ class RobotSpec:
         """
         require(isinstance(values, Mapping), where, "a mapping of keys to values", values)
         if "cameras" not in values:
-            raise UserError(f"Missing key {where}.cameras: list them, or give [] where there are none.")
+            raise UserError(f"Missing key {where}.cameras: list its cameras, or [] for none.")
         cameras = values["cameras"]
         require(isinstance(cameras, list | tuple), f"{where}.cameras", "a list", cameras)
         seen = tuple(

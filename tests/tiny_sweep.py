@@ -17,7 +17,6 @@ from imfvla.completion import is_complete
 from imfvla.entry import entry_point, output_directory
 from imfvla.errors import UserError
 from imfvla.run_directory import RunDirectory
-from imfvla.sources.mcap import McapSource
 
 OVERRIDES = [
     "observation.image_size=[32,32]",
@@ -54,6 +53,7 @@ def launch(arguments: list[str], directory: Path, **environment: str) -> subproc
 def main(config: dict[str, Any]) -> None:
     from imfvla import experiment
     from imfvla.evaluation import evaluate
+    from imfvla.sources.mcap import McapSource
 
     if config["seed"] == 13:
         raise UserError("seed 13 is bad.")
@@ -87,13 +87,11 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
     """A `workbench.Build`: the trained policy in a scene whose stages depend on time and seed."""
     from fakes import FakeEnvironment
 
+    from imfvla.tasks.bimanual_robot import bimanual_robot
     from imfvla.training.checkpoint import load_policy
 
-    env = FakeEnvironment()
-    env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
-    policy = load_policy(RunDirectory(run), step)
-    env.robot = policy.robot
-    return env, policy
+    env = FakeEnvironment(robot=bimanual_robot(("front", "top", "r_wrist"), (32, 32)))
+    return env, load_policy(RunDirectory(run), step)
 
 
 def untimed_table(directory: Path) -> list[dict[str, str]]:

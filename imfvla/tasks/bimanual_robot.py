@@ -2,20 +2,29 @@
 
 from collections.abc import Sequence
 
+from imfvla.errors import UserError
 from imfvla.robot import Camera, RobotSpec
 
 SIDES = ("left", "right")
 JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
 GRIPPER, GRIPPER_LIMITS = "gripper [0, 1]", (0.0, 1.0)
 CONTROL_HZ = 50
+TIME_LIMIT_STEPS = 700  # of an episode of every task
+ALL_VIEWS = ("front", "top", "r_wrist", "l_wrist")
 
 
 def bimanual_robot(views: Sequence[str], image_size: Sequence[int]) -> RobotSpec:
     """The robot as these cameras show it, all at `image_size` (H, W) [px].
 
     Of each arm, the left one first: 7 joint angles and the gripper's opening. Actions are targets of the same
-    channels; a chunk has joints relative to their present angles and openings as they are.
+    channels; a chunk has joints relative to their present angles and openings as they are. Raises UserError for a view
+    that the scene does not have.
     """
+    for view in views:
+        if view not in ALL_VIEWS:
+            raise UserError(
+                f"There is no view {view!r}; choose from {', '.join(ALL_VIEWS)} in observation.views."
+            )
     joints = [(f"joint_{number} [rad]", limits) for number, limits in enumerate(JOINT_LIMITS, 1)]
     arm = [*joints, (GRIPPER, GRIPPER_LIMITS)]
     names = tuple(f"{side}/{name}" for side in SIDES for name, _ in arm)
