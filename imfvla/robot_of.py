@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from imfvla.environments import BIMANUAL, kind_of
 from imfvla.options import build, part_of
 from imfvla.robot import RobotSpec
 from imfvla.views import ViewOptions
@@ -46,6 +47,8 @@ def _robot(config: Mapping[str, Any], views: ViewOptions) -> RobotSpec:
         if group.get(KEY) is not None:
             return RobotSpec.from_json(group[KEY], where)
     if has_environment(config):
+        if kind_of(part_of(config, "task")) != BIMANUAL:
+            part_of(config, f"task.{KEY}")
         # Imported here, as the next one is: a robot that is stated needs neither tasks nor data.
         from imfvla.tasks.bimanual_robot import bimanual_robot
 

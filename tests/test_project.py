@@ -88,7 +88,7 @@ MAY_IMPORT = {
     "generators": {"torch", "nn", "options"},
     "robot": {"options"},
     "same_robot": {"robot"},
-    "robot_of": {"options", "robot", "sources", "tasks", "views"},
+    "robot_of": {"environments", "options", "robot", "sources", "tasks", "views"},
     "resample": set(),
     "chunks": {"torch", "nn", "robot", "statistics"},
     "construction": {"torch", "options"},
