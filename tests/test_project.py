@@ -110,7 +110,7 @@ MAY_IMPORT = {
     "tasks": {"mujoco", "dm_control", "environment", "episode", "gl", "options", "robot", "views"},
     "recording": {"documents", "environment", "episode", "files", "robot", "tasks"},
     "reporting": {"documents", "episode", "files", "options", "protocol", "robot", "run_directory"},
-    "figures": {"documents", "reporting", "robot_of"},
+    "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
     "sources": {"collection", "episode", "options", "recording", "robot", "same_robot", "tasks"},
     "modes": {
         "torch",
