@@ -1,4 +1,4 @@
-"""RoboIMI's two bimanual tasks in dm_control, and both in one scene.
+"""RoboIMI's two bimanual tasks in dm_control, both in one scene, and two tasks on which averages fail.
 
 Importing this package picks the GL backend and does nothing else.
 """
@@ -29,7 +29,7 @@ def load(
     image_size: tuple[int, int] = (96, 96),
     views: tuple[str, ...] = VIEWS,
 ) -> "BimanualEnvironment":
-    """Builds the task `name`: "socket", "transfer", or "combined": the objects of both and one sentence an episode.
+    """Builds the task `name`, one of NAMES. "combined" has the objects of socket and transfer.
 
     Args:
         seed: drawn from by `reset()` without a seed of its own.
@@ -47,8 +47,16 @@ def load(
     # mujoco is imported here: after the backend is chosen, and only by code that simulates.
     from imfvla.tasks.bimanual import BimanualEnvironment
     from imfvla.tasks.combined import CombinedTask
+    from imfvla.tasks.either_arm import EitherArmTask
+    from imfvla.tasks.gate import GateTask
     from imfvla.tasks.socket import SocketTask
     from imfvla.tasks.transfer import TransferTask
 
-    task = {"socket": SocketTask, "transfer": TransferTask, "combined": CombinedTask}[name](variant)
-    return BimanualEnvironment(task, seed=seed, image_size=image_size, views=views)
+    made = {
+        "socket": SocketTask,
+        "transfer": TransferTask,
+        "combined": CombinedTask,
+        "either_arm": EitherArmTask,
+        "gate": GateTask,
+    }
+    return BimanualEnvironment(made[name](variant), seed=seed, image_size=image_size, views=views)

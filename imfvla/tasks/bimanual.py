@@ -184,19 +184,25 @@ class BimanualTask(composer.Task):
 
     def holds(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether both fingers of one arm touch the prop."""
-        other = self._partners(contacts, name)
+        other = self.partners(contacts, name)
         return all(finger & other for finger in self._ids.fingers[side])
 
     def touches(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether any finger of one arm touches the prop."""
-        other = self._partners(contacts, name)
+        other = self.partners(contacts, name)
         return any(finger & other for finger in self._ids.fingers[side])
 
     def on_table(self, contacts: np.ndarray, name: str) -> bool:
         """Whether the prop touches the table."""
-        return self._ids.table in self._partners(contacts, name)
+        return self._ids.table in self.partners(contacts, name)
 
-    def _partners(self, contacts: np.ndarray, name: str) -> set[int]:
+    @property
+    def table(self) -> int:
+        """Geom of the table."""
+        return self._ids.table
+
+    def partners(self, contacts: np.ndarray, name: str) -> set[int]:
+        """Geoms that touch the prop."""
         mine = self._ids.geoms[name][contacts]
         return set(contacts[mine[:, ::-1]].tolist())
 

@@ -23,6 +23,24 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
             "let the left gripper take over the bar",
         ),
     ),
+    "either_arm": (
+        "lift the bar with both arms and let either one keep it",
+        (
+            "raise the bar together and leave it to one arm",
+            "pick up the bar with both grippers and hand it over to either of them",
+            "lift the bar with both hands and let one of them go",
+            "one arm gives the bar and the other one takes it",
+        ),
+    ),
+    "gate": (
+        "carry the bar past the post without touching it",
+        (
+            "bring the bar behind the post and do not touch the post",
+            "carry the orange bar around or over the post",
+            "pass the post with the bar in the right gripper",
+            "take the bar to the other side of the post",
+        ),
+    ),
 }
 
 

@@ -3,10 +3,18 @@
 from imfvla.errors import UserError
 from imfvla.tasks.experts.base import Expert
 from imfvla.tasks.experts.combined import CombinedExpert
+from imfvla.tasks.experts.either_arm import EitherArmExpert
+from imfvla.tasks.experts.gate import GateExpert
 from imfvla.tasks.experts.socket import SocketExpert
 from imfvla.tasks.experts.transfer import TransferExpert
 
-_EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert, "combined": CombinedExpert}
+_EXPERTS = {
+    "socket": SocketExpert,
+    "transfer": TransferExpert,
+    "combined": CombinedExpert,
+    "either_arm": EitherArmExpert,
+    "gate": GateExpert,
+}
 
 
 def make_expert(name: str, *, modes: int, noise: float, hold: int, dwell: int) -> Expert:
