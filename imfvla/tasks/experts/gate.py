@@ -15,7 +15,7 @@ CARRY_HEIGHT = (
 )  # of the bar's centre: straight ahead, all of its end meets the post
 STAGING, GATE = 0.10, 0.045  # from the bar's end to the post: where the bar is aligned, where the ways part
 # Along the line, from the staging on, as a share of the speed before: an average meets the post within a chunk.
-HASTE = 1.6
+HASTE = 2.0
 PAST = 0.03  # how far behind the post the bar's other end comes to rest
 ALIGNED, ALIGNED_ANGLE = 0.006, 0.06  # m, rad
 WIDTH = 0.058  # of a way from the line: beside the post, fingers pass with 17 mm to spare
