@@ -23,7 +23,6 @@ class EitherArmTask(BimanualTask):
     """
 
     name = "either_arm"
-    num_stages = 5
 
     def __init__(self, variant: str) -> None:
         super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH)})

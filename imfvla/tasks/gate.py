@@ -27,16 +27,19 @@ LIFTED = 0.03  # above the resting height
 class GateTask(BimanualTask):
     """Stages: 1 the right gripper holds the bar, 2 lifted, 3 its end is beside or above the post, 4 all of it is past.
 
-    A touch of the post, by a hand or by the bar, ends all that: the stage is 0 from there on.
+    After a touch of the post, by a hand or by the bar, the stage is 0 and the episode has failed.
     """
 
     name = "gate"
-    num_stages = 4
 
     def __init__(self, variant: str) -> None:
         super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH, cap=0.01), "post": Post("post")})
         self.ranges = dict(zip(("bar", "post"), RANGES[variant], strict=True))
         self.touched_post = False  # whether the post has been touched in this episode
+
+    @property
+    def failed(self) -> bool:
+        return self.touched_post
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         self.touched_post = False

@@ -73,14 +73,15 @@ def test_mean_and_median_of_the_ways_run_into_the_post_and_that_is_the_end(gate_
         _, _, stages = play(gate_env, "average")
         touched = int(np.flatnonzero(stages >= 2)[-1]) + 1
         assert gate_env.task.touched_post
-        assert stages.max() < gate_env.success_stage
+        assert not gate_env.step(gate_env.state()).success
+        assert stages.max() < len(gate_env.stages)
         assert not stages[touched:].any()
 
 
 def test_every_way_passes_without_a_touch(gate_env, played):
     post = gate_env.task.prop_pose(gate_env.physics, "post")
     for _, places, stages in played.values():
-        assert stages[-1] == gate_env.success_stage
+        assert stages[-1] == len(gate_env.stages)
         assert places[-1][0] + BAR_LENGTH / 2 < post.position[0]
 
 
@@ -91,9 +92,16 @@ def test_a_touch_is_forgotten_at_the_next_reset(gate_env):
     assert not gate_env.task.touched_post
 
 
+def test_a_touch_after_the_last_stage_undoes_the_success(gate_env):
+    play(gate_env, "left")
+    assert gate_env.step(gate_env.state()).success
+    gate_env.task.touched_post = True
+    assert not gate_env.step(gate_env.state()).success
+
+
 def test_the_post_is_seen_from_everywhere_it_matters(gate_env):
     for seed in range(3):
         gate_env.reset(seed)
         for view, least in (("front", 12), ("top", 20)):
-            red, green, blue = gate_env.look((view,))[view].astype(int).transpose(2, 0, 1)
+            red, green, blue = gate_env.look()[view].astype(int).transpose(2, 0, 1)
             assert ((red > green + 60) & (blue > green + 30)).sum() >= least, view
