@@ -166,7 +166,9 @@ def test_a_missing_run_is_proposed_with_all_evaluations_of_its_rows(tmp_path):
         "python -m imfvla.train +exp=socket_ph32_exec16 generator=l1 'evaluation.nfe=[1]'"
     )
     train, evaluate = answer("socket_infer1", tmp_path).command.split(" && ")
-    assert train == "python -m imfvla.train +exp=socket_ph32_exec16 generator=imf_plain 'evaluation.nfe=[2,3]'"
+    assert (
+        train == "python -m imfvla.train +exp=socket_ph32_exec16 generator=imf_plain 'evaluation.nfe=[2,3]'"
+    )
     assert evaluate == (
         "python -m imfvla.evaluate run=runs/socket_ph32_exec16/generator=imf_plain nfe=1 checkpoint=1/3 "
         "first_seed=100000 episodes=100"
