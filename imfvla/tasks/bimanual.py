@@ -1,4 +1,4 @@
-"""What both tasks share: the composer task with its staged reward, and the environment around it."""
+"""What the tasks share: the composer task with its staged reward, and the environment around it."""
 
 import hashlib
 from collections import OrderedDict
