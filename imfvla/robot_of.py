@@ -1,4 +1,4 @@
-"""Which robot a composed config is about: stated by the task, our own tasks' two arms, what its environment or data says."""
+"""Which robot a composed config is about: stated by the task, our tasks' two arms, or what environment or data say."""
 
 from collections.abc import Mapping
 from contextlib import closing
