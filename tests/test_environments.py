@@ -52,7 +52,8 @@ def test_names_limits_and_robot_of_our_tasks_need_no_simulator():
     """In a process of its own: this one may have imported it already."""
     code = (
         "import sys\nfrom imfvla import tasks\nfrom imfvla.robot_of import robot_of\n"
-        "robot = robot_of({'task': {'name': tasks.NAMES[0]}, 'observation': {'views': ['top'], 'image_size': [8, 8]}})\n"
+        "seen = {'views': ['top'], 'image_size': [8, 8]}\n"
+        "robot = robot_of({'task': {'name': tasks.NAMES[0]}, 'observation': seen})\n"
         "assert robot == tasks.bimanual_robot(('top',), (8, 8)) and tasks.TIME_LIMIT_STEPS == 700\n"
         "assert not {'mujoco', 'dm_control', 'torch'} & sys.modules.keys()"
     )
