@@ -124,6 +124,7 @@ MAY_IMPORT = {
         "recording",
         "reporting",
         "robot",
+        "tasks",
         "types",
     },
     "data": {
