@@ -13,6 +13,8 @@ import torch
 from imfvla.collection import check_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.data.held_out import held_out
+from imfvla.environments import BIMANUAL
+from imfvla.environments import kind_of as kind_of_task
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.gl import select_gl_backend
@@ -53,7 +55,10 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
-    if has_environment(config) and run.status().get("state") != DONE:
+    draws = (
+        has_environment(config) and kind_of_task(config["task"]) == BIMANUAL
+    )  # others choose how, or need no GL
+    if draws and run.status().get("state") != DONE:
         select_gl_backend()  # without one, training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
         if not is_trained:
