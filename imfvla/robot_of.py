@@ -1,4 +1,4 @@
-"""Which robot a composed config is about: stated by the task, our tasks' two arms, or what environment or data say."""
+"""Which robot a config is about: stated by the task, our own two arms, or what environment or data says."""
 
 from collections.abc import Mapping
 from contextlib import closing
