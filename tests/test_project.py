@@ -125,6 +125,7 @@ MAY_IMPORT = {
         "recording",
         "reporting",
         "robot",
+        "tasks",
         "types",
     },
     "data": {
