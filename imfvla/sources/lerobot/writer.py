@@ -1,0 +1,375 @@
+"""Episodes of any robot as a LeRobotDataset v3 that LeRobot opens. Shapes: T control steps, K steps with frames."""
+
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import av
+import numpy as np
+
+from imfvla.errors import UserError
+from imfvla.files import clear_write_errors
+from imfvla.recording.pictures import encode
+from imfvla.robot import Camera, RobotSpec
+from imfvla.sources.base import EpisodeArrays
+from imfvla.sources.checks import misfit, missing_extra
+from imfvla.sources.lerobot import layout
+from imfvla.sources.lerobot.statistics import KEYS, Pool, of_pictures, of_samples
+
+try:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+except ImportError as error:
+    raise missing_extra("lerobot", error) from error
+
+STATE, ACTION = "observation.state", "action"
+MB = 2**20
+DATA_MB, VIDEO_MB = 100, 200  # a file that has grown so far is followed by the next
+BUFFERED = 100  # rows of the table of episodes in memory
+# Every second frame is a key frame, so that any is reached at once; no frame is shown out of order.
+CODECS = {
+    "av1": ("libsvtav1", {"g": "2", "crf": "30", "preset": "12"}),
+    "h264": ("libx264", {"g": "2", "bf": "0", "crf": "20", "preset": "veryfast"}),
+}
+COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
+
+class LeRobotWriter:
+    """Writes episodes one after the other: `with LeRobotWriter(path, robot) as writer: writer.add(episode)`.
+
+    Everything is written beside `path` and moved there at the end; after an error nothing is left. `pictures` is
+    "av1" or "h264" for videos, or "png" for pictures inside the tables. A picture is repeated at steps without one.
+    Raises UserError where something is at `path`, the rate is no whole number, an episode does not fit `robot`, or
+    nothing can be written.
+    """
+
+    def __init__(self, path: str | Path, robot: RobotSpec, *, pictures: str = "av1") -> None:
+        self.path, self._robot, self._codec = Path(path), robot, pictures
+        if os.path.lexists(self.path):
+            raise UserError(f"{self.path} exists already, wanted a new folder: choose another path.")
+        self._check_robot()
+        self._fps = int(robot.control_hz)
+        self._root = self.path.with_name(f".{self.path.name}.part")
+        with clear_write_errors(self.path):
+            shutil.rmtree(self._root, ignore_errors=True)
+            (self._root / "meta").mkdir(parents=True)
+        self._keys = {f"observation.images.{camera.name}": camera for camera in robot.cameras}
+        self._tasks: dict[str, int] = {}
+        self._num_episodes = self._num_rows = self.num_repeats = 0
+        self._pools = {key: Pool() for key in (STATE, ACTION, *COUNTERS, *self._keys)}
+        self._rows: list[dict[str, Any]] = []
+        self._data = _Tables(self._root, layout.DATA, self._data_schema())
+        self._meta = _Tables(self._root, layout.EPISODES, self._episode_schema())
+        videos = () if pictures == "png" else self._keys.items()
+        self._videos = {key: _Videos(self._root, key, camera, self._fps, pictures) for key, camera in videos}
+
+    def __enter__(self) -> "LeRobotWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self.abort()
+            return
+        try:
+            self._close()
+        except BaseException:
+            self.abort()
+            raise
+
+    def add(self, episode: EpisodeArrays) -> None:
+        """Appends an episode, which must have the pictures of all cameras."""
+        self._check_episode(episode)
+        length = len(episode.state)
+        task = self._tasks.setdefault(episode.instructions[0], len(self._tasks))
+        counters = {
+            "timestamp": (np.arange(length) / self._fps).astype(np.float32),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, self._num_episodes),
+            "index": np.arange(self._num_rows, self._num_rows + length),
+            "task_index": np.full(length, task),
+        }
+        # The picture of each step: the last one so far.
+        shown = np.searchsorted(episode.image_steps, np.arange(length), "right") - 1
+        statistics = {STATE: of_samples(episode.state), ACTION: of_samples(episode.action)}
+        statistics |= {key: of_samples(values[:, None]) for key, values in counters.items()}
+        columns = {STATE: _vectors(episode.state), ACTION: _vectors(episode.action)}
+        columns |= {key: pa.array(values) for key, values in counters.items()}
+        entry: dict[str, Any] = {
+            "episode_index": self._num_episodes, "tasks": [episode.instructions[0]], "length": length,
+            "dataset_from_index": self._num_rows, "dataset_to_index": self._num_rows + length,
+        }  # fmt: skip
+        with clear_write_errors(self.path):
+            for key, camera in self._keys.items():
+                frames = episode.images[camera.name]
+                statistics[key] = of_pictures(frames)
+                if key in self._videos:
+                    entry |= self._videos[key].add(frames, shown)
+                else:
+                    columns[key] = _embedded(frames, shown)
+            table = pa.table(
+                {name: columns[name] for name in self._data.schema.names}, schema=self._data.schema
+            )
+            place = self._data.write(table)
+            entry |= {"data/chunk_index": place[0], "data/file_index": place[1]}
+            for key, found in statistics.items():
+                self._pools[key].add(found)
+                entry |= {f"stats/{key}/{name}": found[name].tolist() for name in KEYS}
+            self._rows.append(entry)
+            self._num_episodes, self._num_rows = self._num_episodes + 1, self._num_rows + length
+            self.num_repeats += length - len(episode.image_steps) if self._keys else 0
+            if len(self._rows) == BUFFERED:
+                self._flush()
+
+    def abort(self) -> None:
+        """Removes what was written."""
+        for series in (self._data, self._meta, *self._videos.values()):
+            with suppress(Exception):  # closing flushes, and a full disk must not keep the folder
+                series.close()
+        shutil.rmtree(self._root, ignore_errors=True)
+
+    def _close(self) -> None:
+        if self._num_episodes == 0:
+            raise UserError(f"{self.path}: wanted at least one episode, found none; nothing was written.")
+        with clear_write_errors(self.path):
+            self._flush()
+            for series in (self._data, self._meta, *self._videos.values()):
+                series.close()
+            _write_tasks(self._root / layout.TASKS, self._tasks)
+            stats = {
+                key: {name: value.tolist() for name, value in pool.result().items()}
+                for key, pool in self._pools.items()
+            }
+            contents = {layout.STATS: stats, layout.INFO: self._info(), layout.ROBOT: self._robot.to_json()}
+            for name, value in contents.items():
+                (self._root / name).write_text(layout.dump(value), encoding="utf-8")
+            self._root.rename(self.path)
+
+    def _flush(self) -> None:
+        if self._rows:
+            place = self._meta.place
+            named = {"meta/episodes/chunk_index": place[0], "meta/episodes/file_index": place[1]}
+            self._meta.write(pa.Table.from_pylist([row | named for row in self._rows], self._meta.schema))
+            self._rows = []
+
+    def _check_robot(self) -> None:
+        rate = self._robot.control_hz
+        if rate != int(rate):
+            raise misfit(
+                "robot", "control_hz", "a whole number, as LeRobot wants it", rate, "resample the data"
+            )
+        for camera in self._robot.cameras:
+            if "/" in camera.name or "{" in camera.name or ".." in camera.name:
+                raise misfit("robot", "cameras", "names without / and {", camera.name, "rename the camera")
+            is_odd = camera.height % 2 or camera.width % 2
+            if self._codec != "png" and is_odd:
+                raise misfit(
+                    "robot", f"cameras.{camera.name}", "of an even height and width for a video",
+                    f"{camera.height} x {camera.width}", "write pictures=png in place of videos",
+                )  # fmt: skip
+
+    def _check_episode(self, episode: EpisodeArrays) -> None:
+        wanted = {"state": len(self._robot.state), "action": len(self._robot.action)}
+        for key, width in wanted.items():
+            values = getattr(episode, key)
+            if values.shape != (len(episode.state), width) or not np.isfinite(values).all():
+                raise misfit(
+                    episode.name, key, f"finite, of shape (steps, {width})", f"{values.shape}", "leave it out"
+                )
+        for camera in self._robot.cameras:
+            frames = episode.images.get(camera.name)
+            shape = (len(episode.image_steps), camera.height, camera.width, 3)
+            if frames is None or frames.shape != shape or not shape[0] or episode.image_steps[0] != 0:
+                found = "none" if frames is None else f"{frames.shape} from step {episode.image_steps[:1]}"
+                raise misfit(
+                    episode.name, f"pictures of {camera.name}", f"{shape}, the first at step 0", found,
+                    "leave this camera or this episode out",
+                )  # fmt: skip
+
+    def _data_schema(self) -> pa.Schema:
+        def width(names: tuple[str, ...]) -> pa.DataType:
+            return pa.list_(pa.float32(), len(names)) if len(names) > 1 else pa.float32()
+
+        columns = {STATE: width(self._robot.state), ACTION: width(self._robot.action)}
+        if self._codec == "png":
+            picture = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+            columns |= dict.fromkeys(self._keys, picture)
+        columns |= {key: pa.float32() if key == "timestamp" else pa.int64() for key in COUNTERS}
+        return pa.schema(columns)
+
+    def _episode_schema(self) -> pa.Schema:
+        names = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
+        names += [
+            f"{table}/{part}_index" for table in ("data", "meta/episodes") for part in ("chunk", "file")
+        ]
+        columns: dict[str, pa.DataType] = dict.fromkeys(names, pa.int64())
+        columns["tasks"] = pa.list_(pa.string())
+        for key in self._keys if self._codec != "png" else ():
+            columns |= {f"videos/{key}/{part}_index": pa.int64() for part in ("chunk", "file")}
+            columns |= {f"videos/{key}/{end}_timestamp": pa.float64() for end in ("from", "to")}
+        for key in self._pools:
+            values = pa.list_(pa.float64())
+            if key in self._keys:
+                values = pa.list_(pa.list_(values))
+            columns |= {
+                f"stats/{key}/{name}": pa.list_(pa.int64()) if name == "count" else values for name in KEYS
+            }
+        return pa.schema(columns)
+
+    def _info(self) -> dict[str, Any]:
+        features: dict[str, Any] = {
+            key: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+            for key, names in ((STATE, self._robot.state), (ACTION, self._robot.action))
+        }
+        for key, camera in self._keys.items():
+            features[key] = {
+                "dtype": "image" if self._codec == "png" else "video",
+                "shape": [camera.height, camera.width, 3],
+                "names": ["height", "width", "channels"],
+            }
+            if key in self._videos:
+                features[key]["info"] = self._videos[key].info
+        for key in COUNTERS:
+            kind = "float32" if key == "timestamp" else "int64"
+            features[key] = {"dtype": kind, "shape": [1], "names": None}
+        return {
+            "codebase_version": layout.VERSION,
+            "robot_type": None,
+            "total_episodes": self._num_episodes,
+            "total_frames": self._num_rows,
+            "total_tasks": len(self._tasks),
+            "chunks_size": layout.FILES_A_CHUNK,
+            "data_files_size_in_mb": DATA_MB,
+            "video_files_size_in_mb": VIDEO_MB,
+            "fps": self._fps,
+            "splits": {"train": f"0:{self._num_episodes}"},
+            "data_path": layout.DATA,
+            "video_path": layout.VIDEO if self._videos else None,
+            "features": features,
+        }
+
+
+class _Tables:
+    """A series of parquet files of one schema, one row group a call of `write`."""
+
+    def __init__(self, root: Path, template: str, schema: pa.Schema) -> None:
+        self.schema, self.place = schema, (0, 0)
+        self._root, self._template, self._writer = root, template, None
+
+    def write(self, table: pa.Table) -> tuple[int, int]:
+        """Appends rows and returns chunk and file that hold them."""
+        if self._writer is not None and self._stream.tell() >= DATA_MB * MB:
+            self.close()
+            self.place = _next(self.place)
+        if self._writer is None:
+            path = self._root / self._template.format(chunk_index=self.place[0], file_index=self.place[1])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = path.open("wb")
+            self._writer = pq.ParquetWriter(self._stream, self.schema)
+        self._writer.write_table(table, row_group_size=max(1, len(table)))
+        return self.place
+
+    def close(self) -> None:
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            try:
+                writer.close()
+            finally:
+                self._stream.close()
+
+
+class _Videos:
+    """A series of videos of one camera; frame i of a file is shown at i / fps."""
+
+    def __init__(self, root: Path, key: str, camera: Camera, fps: int, codec: str) -> None:
+        self._root, self._key, self._camera, self._fps, self._codec = root, key, camera, fps, codec
+        self._place, self._container = (0, 0), None
+        self.info: Mapping[str, Any] = {
+            "video.height": camera.height, "video.width": camera.width, "video.codec": codec,
+            "video.pix_fmt": "yuv420p", "video.fps": fps, "video.channels": 3, "has_audio": False,
+            "is_depth_map": False, "video.g": 2, "video.crf": int(CODECS[codec][1]["crf"]),
+        }  # fmt: skip
+
+    def add(self, frames: np.ndarray, shown: np.ndarray) -> dict[str, Any]:
+        """Appends frame `shown[step]` for each step; returns what the table of episodes says of it."""
+        if self._container is not None and self._num_bytes >= VIDEO_MB * MB:
+            self.close()
+            self._place = _next(self._place)
+        if self._container is None:
+            self._open()
+        start = self._num_frames
+        for number in shown:
+            picture = av.VideoFrame.from_ndarray(frames[number], format="rgb24")
+            picture.pts, picture.time_base = self._num_frames, Fraction(1, self._fps)
+            self._mux(picture)
+            self._num_frames += 1
+        return {
+            f"videos/{self._key}/chunk_index": self._place[0],
+            f"videos/{self._key}/file_index": self._place[1],
+            f"videos/{self._key}/from_timestamp": start / self._fps,
+            f"videos/{self._key}/to_timestamp": self._num_frames / self._fps,
+        }
+
+    def close(self) -> None:
+        if self._container is not None:
+            container, self._container = self._container, None
+            try:
+                for packet in self._stream.encode():
+                    container.mux(packet)
+            finally:
+                container.close()
+
+    def _open(self) -> None:
+        os.environ.setdefault("SVT_LOG", "1")  # its encoder prints a page for every file otherwise
+        path = self._root / layout.VIDEO.format(
+            video_key=self._key, chunk_index=self._place[0], file_index=self._place[1]
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._num_frames = self._num_bytes = 0
+        self._container = av.open(str(path), "w", format="mp4", options={"movflags": "faststart"})
+        name, options = CODECS[self._codec]
+        self._stream = self._container.add_stream(name, rate=self._fps, options=dict(options))
+        self._stream.width, self._stream.height = self._camera.width, self._camera.height
+        self._stream.pix_fmt, self._stream.time_base = "yuv420p", Fraction(1, self._fps)
+
+    def _mux(self, picture: av.VideoFrame) -> None:
+        for packet in self._stream.encode(picture):
+            self._num_bytes += packet.size
+            self._container.mux(packet)
+
+
+def _next(place: tuple[int, int]) -> tuple[int, int]:
+    chunk, file = place
+    return (chunk, file + 1) if file + 1 < layout.FILES_A_CHUNK else (chunk + 1, 0)
+
+
+def _vectors(values: np.ndarray) -> pa.Array:
+    flat = pa.array(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.shape[1] > 1 else flat
+
+
+def _embedded(frames: np.ndarray, shown: np.ndarray) -> pa.Array:
+    encoded = [encode(np.ascontiguousarray(frame), lossless=True)[0] for frame in frames]
+    cells = [{"bytes": encoded[number], "path": None} for number in shown]
+    return pa.array(cells, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+
+
+def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
+    """The table of sentences; its metadata says which column pandas takes for the index, where LeRobot looks."""
+    kinds = {"task_index": "int64", "task": "unicode"}
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "metadata": None,
+         "numpy_type": "int64" if name == "task_index" else "object"}
+        for name, kind in kinds.items()
+    ]  # fmt: skip
+    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    table = pa.table(
+        {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())}
+    )
+    pq.write_table(table.replace_schema_metadata({"pandas": layout.dump(pandas)}), path)
