@@ -1,6 +1,8 @@
 """What every reader of outside data refuses, and in which words: one sentence with file, key, wanted, found, remedy."""
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -139,3 +141,36 @@ def bounded_pictures(count: int, height: int, width: int, place: str | Path, key
             f"{count} of {height} x {width}",
             "set camera_every to a larger number, or leave this episode out",
         )
+
+
+def chosen_episodes(
+    chosen: Sequence[int] | None, total: int, place: str | Path, where: str
+) -> tuple[int, ...]:
+    """The numbers of the episodes that the options choose, all for None. Raises UserError where there are no such."""
+    if chosen is None:
+        return tuple(range(total))
+    if beyond := [number for number in chosen if number >= total]:
+        raise UserError(f"{where}.episodes must be below {total}, the number in {place}, found {beyond[0]}.")
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise UserError(
+            f"{where}.episodes must be null or numbers that all differ, found {shortened(list(chosen))}."
+        )
+    return tuple(chosen)
+
+
+def digest_of(root: Path, files: Iterable[Path], options: Any) -> str:
+    """Hex digits of names, sizes and times of change of files below `root`, as `make` tells changes, and of options.
+
+    Contents are not read: a data set may have terabytes. Raises UserError where a file is missing.
+    """
+    digest = hashlib.sha256(json.dumps(options, default=str).encode())
+    for path in sorted(files):
+        try:
+            status = path.stat()
+        except FileNotFoundError as error:
+            raise UserError(
+                f"{path} is missing: the data set names it; copy or download it again."
+            ) from error
+        name = path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name
+        digest.update(json.dumps([name, status.st_size, status.st_mtime_ns]).encode())
+    return digest.hexdigest()

@@ -1,48 +1,25 @@
 """Episodes of a LeRobotDataset v3. Shapes: T control steps, K steps with frames, S state, A action."""
 
-import hashlib
-import json
 import logging
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
-from imfvla.documents import read_json
-from imfvla.errors import UserError
-from imfvla.options import Limit, at_least, build, some
+from imfvla.options import build
 from imfvla.recording.pictures import decode, size_of
-from imfvla.robot import Camera, RobotSpec, bare_name
+from imfvla.robot import RobotSpec
 from imfvla.sources.base import EpisodeArrays
-from imfvla.sources.checks import action_range, bounded_pictures, channels, displaced, misfit, numbers
-from imfvla.sources.lerobot.layout import DOWNLOAD, NUMERIC, ROBOT, STATS, TASKS, Feature, read_info
+from imfvla.sources.checks import bounded_pictures, chosen_episodes, digest_of, misfit, numbers
+from imfvla.sources.lerobot.features import Options, Range, chosen, chosen_cameras, robot_of
+from imfvla.sources.lerobot.layout import DOWNLOAD, TASKS, Feature, read_info
 from imfvla.sources.lerobot.tables import batches, read_episodes, read_rows, read_tasks, scalars, vectors
 from imfvla.sources.lerobot.video import read_frames
 
 log = logging.getLogger(__name__)
-PREFIX = "observation.images."
 TIME_TOLERANCE = 0.1  # of a period: how far a timestamp may lie from its step
-NAMES = some(Limit("the name of a feature", bool))
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What conf/demos/lerobot.yaml documents."""
-
-    path: str
-    episodes: tuple[Annotated[int, at_least(0)], ...] | None
-    state: Annotated[tuple[str, ...], NAMES]
-    action: Annotated[tuple[str, ...], NAMES]
-    cameras: Any  # a mapping view -> feature, or null for all
-    state_names: tuple[str, ...] | None
-    action_names: tuple[str, ...] | None
-    absolute: tuple[str, ...] | None
-    action_min: tuple[float, ...] | None
-    action_max: tuple[float, ...] | None
-    camera_every: Annotated[int, at_least(1)]
-    instruction: str | None
 
 
 class LeRobotSource:
@@ -54,21 +31,15 @@ class LeRobotSource:
         self._options, self._where = options, where
         self._root = Path(options.path)
         self._info = info = read_info(self._root)
-        self._state, self._action = self._chosen(options.state), self._chosen(options.action)
-        self._cameras = self._chosen_cameras()
+        self._state = chosen(info, options.state, f"{where}.state")
+        self._action = chosen(info, options.action, f"{where}.action")
+        self._cameras = chosen_cameras(info, options.cameras, where)
         self._episodes = read_episodes(info, [c.key for c in self._cameras.values() if c.dtype == "video"])
         self._tasks = read_tasks(info)
-        numbers = range(info.num_episodes) if options.episodes is None else options.episodes
-        if beyond := [number for number in numbers if number >= info.num_episodes]:
-            raise UserError(
-                f"{where}.episodes must be below {info.num_episodes}, the number in {info.path}, found {beyond[0]}."
-            )
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise UserError(
-                f"{where}.episodes must be null or numbers that all differ, found {list(numbers)}."
-            )
-        self._numbers = tuple(numbers)
-        self.robot = self._spec()
+        self._numbers = chosen_episodes(options.episodes, info.num_episodes, info.path, where)
+        self.robot = robot_of(
+            info, self._state, self._action, self._cameras, options, where, self._range_in_data
+        )
         relative = sum(index is not None for index in self.robot.relative_to)
         log.info(
             "%s: %d episodes at %g Hz; %d of %d actions are learned relative to the state of their name.",
@@ -87,7 +58,6 @@ class LeRobotSource:
         length = int(self._episodes.length[number])
         path = self._info.data_file(*map(int, self._episodes.data[number]))
         pictures = {view: self._cameras[self.robot.camera(view).name] for view in views}
-        embedded = [feature.key for feature in pictures.values() if feature.dtype == "image"]
         features = [feature.key for feature in (*self._state, *self._action)]
         columns = [*dict.fromkeys([*features, "episode_index", "frame_index", "timestamp", "task_index"])]
         first = int(self._episodes.first_row[number])
@@ -96,7 +66,7 @@ class LeRobotSource:
         steps = np.arange(0, length, self._options.camera_every) if self._cameras else np.zeros(0, np.int64)
         images = {}
         for view, feature in pictures.items():
-            if feature.key in embedded:
+            if feature.dtype == "image":
                 images[view] = self._embedded(path, feature, first, length)
             else:
                 places, starts = self._episodes.videos[feature.key]
@@ -117,142 +87,30 @@ class LeRobotSource:
         )
 
     def digest(self) -> str:
-        """Sizes and times of change of the data and videos, contents of the metadata, options."""
-        digest = hashlib.sha256(
-            json.dumps([asdict(self._options), self.robot.to_json()], default=str).encode()
-        )
-        for path in sorted((self._root / "meta").rglob("*")):
-            if path.is_file():
-                digest.update(path.relative_to(self._root).as_posix().encode() + path.read_bytes())
-        for path in self._content():
-            status = path.stat()
-            name = path.relative_to(self._root).as_posix()
-            digest.update(json.dumps([name, status.st_size, status.st_mtime_ns]).encode())
-        return digest.hexdigest()
-
-    def _content(self) -> list[Path]:
-        """The data and video files of the chosen episodes. Raises UserError where one is missing."""
-        chosen = np.array(self._numbers)
-        files = {
-            self._info.data_file(*place) for place in np.unique(self._episodes.data[chosen], axis=0).tolist()
-        }
+        """Of the sizes and times of change of all files that are read, and of the options."""
+        root, meta = self._root, self._root / "meta"
+        files = [path for path in meta.rglob("*") if path.is_file()]
+        files += {self._info.data_file(*place) for place in self._places(self._episodes.data)}
         for key, (places, _) in self._episodes.videos.items():
-            files |= {
-                self._info.video_file(key, *place) for place in np.unique(places[chosen], axis=0).tolist()
-            }
-        for path in sorted(files):
-            if not path.is_file():
-                raise UserError(f"{path} is missing: {self._info.path} names it; {DOWNLOAD}.")
-        return sorted(files)
+            files += {self._info.video_file(key, *place) for place in self._places(places)}
+        options = {key: value for key, value in asdict(self._options).items() if key != "path"}
+        return digest_of(root, files, [options, self.robot.to_json()])
 
-    def _chosen(self, keys: tuple[str, ...]) -> list[Feature]:
-        """Numeric features. Raises UserError where one is missing or no list of numbers."""
-        known = self._info.features
-        numeric = [key for key, feature in known.items() if NUMERIC.fullmatch(feature.dtype)]
-        for key in keys:
-            if key not in known:
-                raise misfit(
-                    self._info.path, "features", f"with {key}", ", ".join(known),
-                    f"choose among {', '.join(numeric)} in {self._where}",
-                )  # fmt: skip
-            feature = known[key]
-            if key not in numeric or len(feature.shape) != 1 or feature.shape[0] < 1:
-                raise misfit(
-                    self._info.path, f"features.{key}", "a list of numbers",
-                    f"{feature.dtype} of shape {list(feature.shape)}",
-                    f"choose among {', '.join(numeric)} in {self._where}",
-                )  # fmt: skip
-        return [known[key] for key in keys]
+    def _places(self, places: np.ndarray) -> list[list[int]]:
+        """Chunk and file of the chosen episodes, each once."""
+        return np.unique(places[list(self._numbers)], axis=0).tolist()
 
-    def _chosen_cameras(self) -> dict[str, Feature]:
-        """View -> feature: those of the options, else all colour cameras."""
-        known = {key: feature for key, feature in self._info.features.items() if feature.is_camera}
-        chosen = self._options.cameras
-        if chosen is None:
-            colour = {key: feature for key, feature in known.items() if not feature.is_depth}
-            views = {key: key.removeprefix(PREFIX).rpartition(".")[2] for key in colour}
-            is_unique = len(set(views.values())) == len(views)
-            return {views[key] if is_unique else key: feature for key, feature in colour.items()}
-        key = f"{self._where}.cameras"
-        if not isinstance(chosen, Mapping):
-            raise UserError(f"{key} must be null or a mapping of views to features, found {chosen!r}.")
-        for view, name in chosen.items():
-            if name not in known:
-                raise UserError(f"{key}.{view} must be one of {', '.join(known) or 'none'}, found {name!r}.")
-        return {str(view): known[name] for view, name in chosen.items()}
-
-    def _spec(self) -> RobotSpec:
-        options, where = self._options, self._where
-        state = self._names(self._state, options.state_names, f"{where}.state_names")
-        action = self._names(self._action, options.action_names, f"{where}.action_names")
-        cameras = tuple(
-            Camera(view, *feature.picture_size(self._info.path)) for view, feature in self._cameras.items()
-        )
-        if (stored := self._stored_robot(state, action)) is not None and options.absolute is None:
-            relative_to = stored.relative_to
-        else:
-            relative_to = displaced(state, action, options.absolute, where)
-        stated = (options.action_min, options.action_max)
-        if stored is not None:
-            seen = np.array(stored.action_min), np.array(stored.action_max)
-        else:
-            seen = (np.zeros(len(action)), np.ones(len(action))) if None not in stated else self._seen_range()
-        low, high = action_range(action, stated, seen, where)
-        return RobotSpec(state, action, relative_to, low, high, self._info.fps, cameras)
-
-    def _stored_robot(self, state: tuple[str, ...], action: tuple[str, ...]) -> RobotSpec | None:
-        """The robot that imfvla wrote into the data set, if it did and no channel was chosen or named otherwise."""
-        path = self._root / ROBOT
-        if not path.is_file():
-            return None
-        try:
-            robot = RobotSpec.from_json(read_json(path, DOWNLOAD, mapping=True))
-        except UserError as error:
-            raise UserError(f"{path}: {error} LeRobot does not need this file: correct it or move it away.") from error
-        return robot if (robot.state, robot.action) == (state, action) else None
-
-    def _names(self, features: list[Feature], given: tuple[str, ...] | None, key: str) -> tuple[str, ...]:
-        """Names of channels: those of the options, else the data set's, with the feature where two are equal."""
-        width = sum(feature.shape[0] for feature in features)
-        if given is not None:
-            if len(given) != width:
-                wanted = " + ".join(f"{feature.key} ({feature.shape[0]})" for feature in features)
-                raise UserError(f"{key} must have {width} names, of {wanted}, found {len(given)}.")
-            return channels(given, key, need_units=False)
-        names = [
-            name
-            for feature in features
-            for name in feature.names or [f"{feature.key}_{place}" for place in range(feature.shape[0])]
-        ]
-        if len(set(map(bare_name, names))) < len(names):
-            names = [
-                f"{feature.key}/{name}"
-                for feature in features
-                for name in feature.names or [str(place) for place in range(feature.shape[0])]
-            ]
-        return channels(names, key, need_units=False)
-
-    def _seen_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and greatest actions (A,): of meta/stats.json, or of the data where it has none."""
-        path = self._root / STATS
-        if path.is_file():
-            stats = read_json(path, DOWNLOAD, mapping=True)
-            found = [_stated(stats, feature, path) for feature in self._action]
-            if None not in found:
-                return np.concatenate([low for low, _ in found]), np.concatenate([high for _, high in found])
-        low, high = None, None
-        for index in range(len(self)):
-            action = self._action_of(index)
-            low = action.min(0) if low is None else np.minimum(low, action.min(0))
-            high = action.max(0) if high is None else np.maximum(high, action.max(0))
-        return low, high
-
-    def _action_of(self, index: int) -> np.ndarray:
-        number = self._numbers[index]
-        path = self._info.data_file(*map(int, self._episodes.data[number]))
-        first, length = int(self._episodes.first_row[number]), int(self._episodes.length[number])
-        table = read_rows(path, [feature.key for feature in self._action], first, length)
-        return self._numbers_of(table, self._action, path, ())
+    def _range_in_data(self) -> Range:
+        """Least and greatest actions (A,) of the chosen episodes."""
+        lows, highs = [], []
+        for number in self._numbers:
+            path = self._info.data_file(*map(int, self._episodes.data[number]))
+            first, length = int(self._episodes.first_row[number]), int(self._episodes.length[number])
+            table = read_rows(path, [feature.key for feature in self._action], first, length)
+            action = self._numbers_of(table, self._action, path, ())
+            lows.append(action.min(0))
+            highs.append(action.max(0))
+        return np.min(lows, 0), np.max(highs, 0)
 
     def _numbers_of(
         self, table: Any, features: list[Feature], path: Path, names: tuple[str, ...]
@@ -326,26 +184,6 @@ def _picture(cell: Any, size: tuple[int, int], path: Path, key: str) -> np.ndarr
     except ValueError as error:
         wanted = f"a PNG or JPEG of {size[0]} x {size[1]}"
         raise misfit(path, key, wanted, str(error), DOWNLOAD) from error
-
-
-def _stated(stats: Mapping[str, Any], feature: Feature, path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Least and greatest values of a feature, None where the statistics have none."""
-    entry = stats.get(feature.key)
-    if not isinstance(entry, dict) or not {"min", "max"} <= entry.keys():
-        return None
-    found = []
-    for key in ("min", "max"):
-        try:
-            values = np.array(entry[key], np.float64).reshape(-1)
-        except (ValueError, TypeError):
-            values = np.zeros(0)
-        if values.shape != feature.shape or not np.isfinite(values).all():
-            raise misfit(
-                path, f"{feature.key}.{key}", f"{feature.shape[0]} finite numbers", entry[key],
-                "state action_min and action_max in the options",
-            )  # fmt: skip
-        found.append(values)
-    return found[0], found[1]
 
 
 def open_source(options: Mapping[str, Any], *, where: str = "demos") -> LeRobotSource:
