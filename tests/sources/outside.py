@@ -46,5 +46,6 @@ def episode(number: int, num_steps: int = 8, every: int = 1, robot: RobotSpec = 
 
 
 def options(name: str, **changes: Any) -> dict[str, Any]:
-    """The options of conf/demos/<name>.yaml with these values."""
-    return yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8")) | changes
+    """The options of conf/demos/<name>.yaml with these values, without what all sources share."""
+    found = yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8"))
+    return {key: value for key, value in found.items() if key not in ("source", "frames_directory")} | changes
