@@ -4,12 +4,12 @@ Shapes: To observed steps, V views, H W pixels, S state, Tp predicted steps, A a
 """
 
 import time
-from typing import Any
 
 import numpy as np
 import torch
 
 from imfvla.ensemble import TemporalEnsemble
+from imfvla.environment import Environment
 from imfvla.episode import Decision
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
@@ -47,12 +47,9 @@ class ChunkActor:
         self._noise_seed, self._noise_scale = noise_seed, noise_scale
         self._device = torch.device(device)
 
-    def reset(self, env: Any, seed: int) -> None:
+    def reset(self, env: Environment, seed: int) -> None:
         """Forgets the last episode. `env` has the instruction and the limits of the actions [rad], [0, 1]."""
-        spec = env.action_spec()
-        self._minimum, self._maximum = (
-            np.broadcast_to(limit, spec.shape).astype(np.float32) for limit in (spec.minimum, spec.maximum)
-        )
+        self._minimum, self._maximum = np.float32(env.robot.action_min), np.float32(env.robot.action_max)
         self._instruction = torch.from_numpy(tokenize(env.instruction)).unsqueeze(0).to(self._device)
         self._seed = seed
         self._images: dict[int, np.ndarray] = {}
@@ -60,7 +57,7 @@ class ChunkActor:
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
         """The action of `step`; looks and replans where the horizon says so.
 
         Raises:

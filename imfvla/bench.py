@@ -131,14 +131,15 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
 
     from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency
-    from imfvla.benchmarks.simulation import make_environment, measure_demonstrations, measure_simulation
+    from imfvla.benchmarks.simulation import measure_demonstrations, measure_simulation
     from imfvla.benchmarks.training import measure_training
+    from imfvla.environments import environment_of
     from imfvla.policy import build_policy
     from imfvla.rehearsal import build_unfitted
     from imfvla.training.data import prepare_windows
 
     parts, figures = config["parts"], {}
-    env = make_environment(composed)
+    env = environment_of(composed)
     if "simulation" in parts:
         figures["simulation"] = measure_simulation(env)
     if "simulation" in parts or "training" in parts:

@@ -87,10 +87,10 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
     """A `workbench.Build`: the trained policy in a scene whose stages depend on time and seed."""
     from fakes import FakeEnvironment
 
+    from imfvla.tasks.bimanual_robot import bimanual_robot
     from imfvla.training.checkpoint import load_policy
 
-    env = FakeEnvironment()
-    env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
+    env = FakeEnvironment(robot=bimanual_robot(("front", "top", "r_wrist"), (32, 32)))
     return env, load_policy(RunDirectory(run), step)
 
 

@@ -55,9 +55,9 @@ def resets(count: int, watch: Watch) -> None:
     from imfvla import tasks  # here, since a GL backend is picked at import
 
     env = tasks.load("socket", image_size=(32, 32))
-    action = np.zeros(env.action_spec().shape)
+    action = np.zeros(len(env.robot.action))
     for seed in range(100_000, 100_000 + count):
-        env.reset(seed=seed)
+        env.reset(seed)
         env.look()
         for _ in range(2):
             env.step(action)

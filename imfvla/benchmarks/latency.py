@@ -1,7 +1,6 @@
 """The time of one action chunk at batch 1 on one thread, from numpy observation to numpy chunk, and its parts."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -9,6 +8,7 @@ import torch
 from imfvla.actor import ChunkActor
 from imfvla.benchmarks.clock import threads, times_ms
 from imfvla.benchmarks.sizes import core_inputs
+from imfvla.environment import Environment
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
@@ -18,7 +18,7 @@ FEWEST_CALLS = 50  # of a sampler with many steps
 
 
 def measure_latency(
-    env: Any, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
+    env: Environment, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
 ) -> dict[str, dict[str, float]]:
     """Times [ms] by "infer1", ...: median and p95 of a chunk, and the medians of its parts.
 

@@ -10,6 +10,7 @@ from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
 from imfvla.recording import Recordings
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
 NUM_STEPS = 21
 NUM_EPISODES = 2
@@ -60,7 +61,7 @@ def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
 def test_a_window_sees_what_a_rollout_would_see(dense, horizon):
     windows = Windows(dense, Horizon(*horizon))
     batch = whole(windows)
-    scene = StillScene(VIEWS, (8, 8))
+    scene = StillScene(bimanual_robot(VIEWS, (8, 8)))
     for row in range(0, len(windows), 5):
         recorded = synthetic_actions(int(windows.episodes[row]), NUM_STEPS)
         for past, step in enumerate(windows.horizon.observed_steps(windows.steps[row])):
