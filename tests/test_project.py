@@ -99,7 +99,7 @@ MAY_IMPORT = {
         "statistics",
         "types",
     },
-    "sources": {"documents", "files", "options", "recording", "robot"},
+    "sources": {"documents", "episode", "files", "options", "recording", "robot"},
     "tasks": {"mujoco", "dm_control", "episode", "gl", "options", "views"},
     "recording": {"documents", "episode", "files"},
     "reporting": {"documents", "episode", "files", "options", "protocol", "run_directory"},

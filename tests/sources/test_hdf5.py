@@ -8,46 +8,27 @@ from imfvla.errors import UserError
 from imfvla.robot import Camera
 
 h5py = pytest.importorskip("h5py", reason="needs the extra hdf5")
-from outside import options, picture  # noqa: E402
+from outside import (  # noqa: E402
+    EEF_ACTION,
+    EEF_STATE,
+    SMALL,
+    arrays,
+    options,
+    small_frames,
+    write_robomimic,
+)
 
 from imfvla.sources.hdf5 import open_source  # noqa: E402
 
-STATE = {"eef_pos": ["x [m]", "y [m]"], "gripper_qpos": ["gripper [m]"]}
-ACTION = ["x [m]", "y [m]", "gripper [m]"]
 JOINTS = ["waist [rad]", "elbow [rad]", "gripper [0, 1]"]
-SIZE = (12, 20)
-
-
-def arrays(number, num_steps=6):
-    rng = np.random.default_rng(number)
-    return rng.uniform(-1, 1, (num_steps, 3)), rng.uniform(-1, 1, (num_steps, 3))
-
-
-def frames(number, num_steps=6):
-    found = np.stack([picture(step, *SIZE, number) for step in range(num_steps)])
-    found[..., 0] = 255 - found[..., 0]  # red differs from blue
-    return found
-
-
-def write_robomimic(path, numbers=(0, 1, 10)):
-    with h5py.File(path, "w") as file:
-        for number in numbers:
-            demo = file.create_group(f"data/demo_{number}")
-            state, action = arrays(number)
-            demo["obs/eef_pos"], demo["obs/gripper_qpos"] = state[:, :2], state[:, 2:]
-            demo["actions"], demo["actions_abs"] = action, action + 1
-            demo.create_dataset(
-                "obs/agentview_image", data=frames(number), compression="gzip", chunks=(1, *SIZE, 3)
-            )
-    return path
 
 
 def robomimic(path, **changes):
     common = {
         "layout": "robomimic",
         "control_hz": 20,
-        "state": STATE,
-        "action": ACTION,
+        "state": EEF_STATE,
+        "action": EEF_ACTION,
         "instruction": "lift",
     }
     return open_source(options("hdf5", path=str(path)) | common | changes)
@@ -58,7 +39,7 @@ def write_act(folder, numbers=(0, 1, 10), encode=None):
     for number in numbers:
         with h5py.File(folder / f"episode_{number}.hdf5", "w") as file:
             file["observations/qpos"], file["action"] = arrays(number)
-            seen = frames(number)
+            seen = small_frames(number)
             file["observations/images/top"] = seen if encode is None else encode(seen)
     return folder
 
@@ -97,14 +78,14 @@ def test_robomimic_has_many_episodes_a_file_in_the_order_of_their_numbers(tmp_pa
     source = robomimic(write_robomimic(tmp_path / "demo.hdf5"))
     assert source.robot.state == ("x [m]", "y [m]", "gripper [m]")
     assert source.robot.relative_to == (0, 1, None)
-    assert source.robot.cameras == (Camera("agentview_image", *SIZE),)
+    assert source.robot.cameras == (Camera("agentview_image", *SMALL),)
     assert source.robot.control_hz == 20
     for index, number in enumerate((0, 1, 10)):
         read, (state, action) = source.episode(index, ("agentview_image",)), arrays(number)
         assert read.name == f"demo/data/demo_{number}"
         assert np.array_equal(read.state, state.astype(np.float32))
         assert np.array_equal(read.action, action.astype(np.float32))
-        assert np.array_equal(read.images["agentview_image"], frames(number))
+        assert np.array_equal(read.images["agentview_image"], small_frames(number))
         assert read.instructions == ("lift",)
     actions = np.concatenate([arrays(number)[1] for number in (0, 1, 10)])
     assert np.allclose(source.robot.action_min, actions.min(0))
@@ -121,13 +102,15 @@ def test_act_has_an_episode_a_file_with_raw_and_encoded_pictures(tmp_path, encod
     read = source.episode(2, ("top",))
     assert (read.name, len(source)) == ("episode_10", 3)
     assert np.array_equal(read.state, arrays(10)[0].astype(np.float32))
-    assert np.array_equal(read.images["top"], frames(10))
+    assert np.array_equal(read.images["top"], small_frames(10))
 
 
 def test_red_and_blue_can_be_exchanged(tmp_path):
     folder = write_act(tmp_path / "act", encode=lambda seen: padded(encoded(seen, swap=False)))
-    assert np.array_equal(act(folder, picture_order="bgr").episode(0, ("top",)).images["top"], frames(0))
-    assert not np.array_equal(act(folder).episode(0, ("top",)).images["top"], frames(0))
+    assert np.array_equal(
+        act(folder, picture_order="bgr").episode(0, ("top",)).images["top"], small_frames(0)
+    )
+    assert not np.array_equal(act(folder).episode(0, ("top",)).images["top"], small_frames(0))
 
 
 @pytest.mark.parametrize("every", [1, 4, 100])
@@ -136,7 +119,7 @@ def test_frames_episodes_and_cameras_can_be_chosen(tmp_path, every):
     source = act(folder, episodes=[1], camera_every=every, cameras={"eye": "top"})
     read = source.episode(0, ("eye",))
     assert (read.name, len(source)) == ("episode_1", 1)
-    assert np.array_equal(read.images["eye"], frames(1)[::every])
+    assert np.array_equal(read.images["eye"], small_frames(1)[::every])
     assert source.num_frames(0) == len(read.image_steps) == len(read.images["eye"])
     assert act(folder, cameras={}).num_frames(0) == 0
 
@@ -144,7 +127,7 @@ def test_frames_episodes_and_cameras_can_be_chosen(tmp_path, every):
 def test_pictures_are_read_in_blocks(tmp_path, monkeypatch):
     monkeypatch.setattr("imfvla.sources.hdf5.file.BLOCK", 4)
     source = act(write_act(tmp_path / "act"), camera_every=2)
-    assert np.array_equal(source.episode(0, ("top",)).images["top"], frames(0)[::2])
+    assert np.array_equal(source.episode(0, ("top",)).images["top"], small_frames(0)[::2])
 
 
 def test_the_digest_follows_files_and_options(tmp_path):

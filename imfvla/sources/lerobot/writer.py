@@ -1,7 +1,5 @@
 """Episodes of any robot as a LeRobotDataset v3 that LeRobot opens. Shapes: T control steps, K steps with frames."""
 
-import os
-import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +17,7 @@ from imfvla.sources.checks import misfit, missing_extra
 from imfvla.sources.lerobot import layout
 from imfvla.sources.lerobot.series import DATA_MB, VIDEO_MB, Tables, Videos
 from imfvla.sources.lerobot.statistics import KEYS, Pool, of_pictures, of_samples
+from imfvla.sources.new_folder import NewFolder
 
 try:
     import pyarrow as pa
@@ -42,38 +41,29 @@ class LeRobotWriter:
 
     def __init__(self, path: str | Path, robot: RobotSpec, *, pictures: str = "av1") -> None:
         self.path, self._robot, self._codec = Path(path), robot, pictures
-        if os.path.lexists(self.path):
-            raise UserError(f"{self.path} exists already, wanted a new folder: choose another path.")
+        self._folder = NewFolder(self.path, self._close, self._abort)
         self._check_robot()
         self._fps = int(robot.control_hz)
-        self._root = self.path.with_name(f".{self.path.name}.part")
-        with clear_write_errors(self.path):
-            shutil.rmtree(self._root, ignore_errors=True)
-            (self._root / "meta").mkdir(parents=True)
         self._keys = {f"observation.images.{camera.name}": camera for camera in robot.cameras}
         self._tasks: dict[str, int] = {}
         self._num_episodes = self._num_rows = self.num_repeats = 0
         self._pools = {key: Pool() for key in (STATE, ACTION, *COUNTERS, *self._keys)}
         self._rows: list[dict[str, Any]] = []
-        self._data = Tables(self._root, layout.DATA, self._data_schema())
-        self._meta = Tables(self._root, layout.EPISODES, self._episode_schema())
-        videos = () if pictures == "png" else self._keys.items()
-        self._videos = {key: Videos(self._root, key, camera, self._fps, pictures) for key, camera in videos}
 
     def __enter__(self) -> "LeRobotWriter":
+        self._root = self._folder.__enter__()
+        self._data = Tables(self._root, layout.DATA, self._data_schema())
+        self._meta = Tables(self._root, layout.EPISODES, self._episode_schema())
+        videos = () if self._codec == "png" else self._keys.items()
+        self._videos = {
+            key: Videos(self._root, key, camera, self._fps, self._codec) for key, camera in videos
+        }
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is not None:
-            self.abort()
-            return
-        try:
-            self._close()
-        except BaseException:
-            self.abort()
-            raise
+        self._folder.__exit__(kind, error, trace)
 
     def add(self, episode: EpisodeArrays) -> None:
         """Appends an episode, which must have the pictures of all cameras."""
@@ -119,29 +109,27 @@ class LeRobotWriter:
             if len(self._rows) == BUFFERED:
                 self._flush()
 
-    def abort(self) -> None:
-        """Removes what was written."""
+    def _abort(self) -> None:
         for series in (self._data, self._meta, *self._videos.values()):
             with suppress(Exception):  # closing flushes, and a full disk must not keep the folder
                 series.close()
-        shutil.rmtree(self._root, ignore_errors=True)
 
     def _close(self) -> None:
         if self._num_episodes == 0:
             raise UserError(f"{self.path}: wanted at least one episode, found none; nothing was written.")
-        with clear_write_errors(self.path):
-            self._flush()
-            for series in (self._data, self._meta, *self._videos.values()):
-                series.close()
-            _write_tasks(self._root / layout.TASKS, self._tasks)
-            stats = {
-                key: {name: value.tolist() for name, value in pool.result().items()}
-                for key, pool in self._pools.items()
-            }
-            contents = {layout.STATS: stats, layout.INFO: self._info(), layout.ROBOT: self._robot.to_json()}
-            for name, value in contents.items():
-                (self._root / name).write_text(layout.dump(value), encoding="utf-8")
-            self._root.rename(self.path)
+        self._flush()
+        for series in (self._data, self._meta, *self._videos.values()):
+            series.close()
+        _write_tasks(self._root / layout.TASKS, self._tasks)
+        stats = {
+            key: {name: value.tolist() for name, value in pool.result().items()}
+            for key, pool in self._pools.items()
+        }
+        contents = {layout.STATS: stats, layout.INFO: self._info(), layout.ROBOT: self._robot.to_json()}
+        for name, value in contents.items():
+            path = self._root / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(layout.dump(value), encoding="utf-8")
 
     def _flush(self) -> None:
         if self._rows:

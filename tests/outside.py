@@ -9,7 +9,7 @@ import yaml
 from imfvla.robot import Camera, RobotSpec
 from imfvla.sources import EpisodeArrays
 
-CONF = Path(__file__).resolve().parents[2] / "conf" / "demos"
+CONF = Path(__file__).resolve().parents[1] / "conf" / "demos"
 ROBOT = RobotSpec(
     state=("shoulder [rad]", "elbow [rad]", "gripper [0, 1]"),
     action=("shoulder [rad]", "elbow [rad]", "gripper [0, 1]"),
@@ -49,3 +49,35 @@ def options(name: str, **changes: Any) -> dict[str, Any]:
     """The options of conf/demos/<name>.yaml with these values, without what all sources share."""
     found = yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8"))
     return {key: value for key, value in found.items() if key not in ("source", "frames_directory")} | changes
+
+
+EEF_STATE = {"eef_pos": ["x [m]", "y [m]"], "gripper_qpos": ["gripper [m]"]}
+EEF_ACTION = ["x [m]", "y [m]", "gripper [m]"]
+SMALL = (12, 20)
+
+
+def arrays(number, num_steps=6):
+    rng = np.random.default_rng(number)
+    return rng.uniform(-1, 1, (num_steps, 3)), rng.uniform(-1, 1, (num_steps, 3))
+
+
+def small_frames(number, num_steps=6):
+    found = np.stack([picture(step, *SMALL, number) for step in range(num_steps)])
+    found[..., 0] = 255 - found[..., 0]  # red differs from blue
+    return found
+
+
+def write_robomimic(path, numbers=(0, 1, 10)):
+    """data/demo_<number> in an HDF5 file as robomimic's, each of 6 steps with one camera."""
+    import h5py  # an extra
+
+    with h5py.File(path, "w") as file:
+        for number in numbers:
+            demo = file.create_group(f"data/demo_{number}")
+            state, action = arrays(number)
+            demo["obs/eef_pos"], demo["obs/gripper_qpos"] = state[:, :2], state[:, 2:]
+            demo["actions"], demo["actions_abs"] = action, action + 1
+            demo.create_dataset(
+                "obs/agentview_image", data=small_frames(number), compression="gzip", chunks=(1, *SMALL, 3)
+            )
+    return path
