@@ -136,6 +136,7 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
     from imfvla.environments import environment_of
     from imfvla.policy import build_policy
     from imfvla.rehearsal import build_unfitted
+    from imfvla.sources.mcap import McapSource
     from imfvla.training.data import prepare_windows
 
     parts, figures = config["parts"], {}
@@ -147,10 +148,11 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
         figures.setdefault("simulation", {}).update(demonstrating)
     torch.manual_seed(0)
     if "training" in parts:
-        policy = build_policy(composed, prepare_windows(composed, demonstrations).statistics())
+        source = McapSource(demonstrations)
+        policy = build_policy(composed, prepare_windows(composed, source).statistics())
         with threads(torch.get_num_threads()):
             figures["training"] = measure_training(
-                composed, policy, demonstrations, scratch / "run", config["training_steps"]
+                composed, policy, source, scratch / "run", config["training_steps"]
             )
     else:
         policy = build_unfitted(composed)

@@ -16,7 +16,7 @@ from imfvla.environments import BIMANUAL, KIND, environment_of, kind_of
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
-from imfvla.options import Limit, at_least, build, part_of, require, within
+from imfvla.options import Limit, at_least, build, one_of, part_of, require, within
 from imfvla.progress import Progress
 from imfvla.protocol import MAX_WORKERS
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
@@ -44,6 +44,7 @@ class DemoOptions:
     frames_directory: Annotated[str, NOT_EMPTY] | None  # of the frame store, see imfvla.training.data
     camera_every: Annotated[int, at_least(1)]
     workers: Annotated[int, within(0, MAX_WORKERS)] | None
+    source: Annotated[str, one_of("scripted")] = "scripted"  # of imfvla.sources.opening
 
 
 @dataclass(frozen=True, slots=True)

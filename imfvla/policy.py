@@ -3,7 +3,7 @@
 Shapes: B batch, Tp predicted steps, A action.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,8 @@ from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
 from imfvla.protocol import USUAL_NOISE
+from imfvla.robot import RobotSpec
+from imfvla.robot_of import robot_of, view_options
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -26,7 +28,9 @@ class Policy(nn.Module):
         self,
         *,
         horizon: Horizon,
-        action_dim: int,
+        robot: RobotSpec,
+        views: Sequence[str],
+        image_size: tuple[int, int],
         chunks: ChunkFrame,
         encoder: nn.Module,
         core: nn.Module,
@@ -34,7 +38,9 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         self.horizon = horizon
-        self.action_dim = action_dim
+        self.robot = robot
+        self.views = tuple(views)  # cameras that it sees, in this order
+        self.image_size = tuple(image_size)  # (H, W) [px] at which it sees them
         self.encoder = encoder
         self.core = core
         self.generator = generator
@@ -43,18 +49,22 @@ class Policy(nn.Module):
     @property
     def noise_shape(self) -> tuple[int, int]:
         """(Tp, A) of the noise that one prediction starts from."""
-        return self.horizon.pred, self.action_dim
+        return self.horizon.pred, len(self.robot.action)
 
-    def first_steps(self, steps: int) -> dict[str, int]:
-        """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
-        if not hasattr(self.generator, "first_steps"):
+    @property
+    def has_stages(self) -> bool:
+        """Whether what is learned depends on the step: the generator has `span` and `begin_step`."""
+        return hasattr(self.generator, "begin_step")
+
+    def spans(self, steps: int) -> dict[str, tuple[float, float]]:
+        """Of parameters that do not learn in all of `steps` steps, the steps [first, end) in which they do, by name."""
+        if not self.has_stages:
             return {}
-        later = self.generator.first_steps(self.core, steps)
-        return {f"core.{name}": step for name, step in later.items()}
+        return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
 
     def begin_step(self, step: int, steps: int) -> None:
         """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
-        if hasattr(self.generator, "begin_step"):
+        if self.has_stages:
             self.generator.begin_step(self.core, step, steps)
 
     def targets(self, batch: Batch) -> Tensor:
@@ -104,17 +114,25 @@ def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
 def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
     """The policy that a composed configuration describes, with the normalisers fitted where `statistics` are given.
 
+    Encoder and core are handed what robot and observation decide: the numbers of views, states and actions, and where
+    the state is among the context tokens.
     Without statistics the normalisers are not-a-number until a checkpoint fills them. Raises UserError where the
     parts do not fit together.
     """
     try:
-        horizon = Horizon(**config["horizon"])
+        horizon, robot, seen = Horizon(**config["horizon"]), robot_of(config), view_options(config)
+        chunks = ChunkFrame(config["action_frame"], horizon.pred, robot)
+        encoder = construct(config["encoder"], "encoder", views=len(seen.views), state_dim=len(robot.state))
         policy = Policy(
             horizon=horizon,
-            action_dim=config["action_dim"],
-            chunks=ChunkFrame(config["action_frame"], horizon.pred, config["action_dim"]),
-            encoder=construct(config["encoder"], "encoder"),
-            core=construct(config["core"], "core"),
+            robot=robot,
+            views=seen.views,
+            image_size=seen.image_size,
+            chunks=chunks,
+            encoder=encoder,
+            core=construct(
+                config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
+            ),
             generator=construct(config["generator"], "generator"),
         )
     except KeyError as error:
@@ -133,7 +151,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         raise UserError(
             f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
             f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
-            f"core.velocity_head=true with generator=imf_staged or generator.v_from=head, "
+            f"core.velocity_head=true with generator=imf or generator=imf_plain generator.v_from=head, "
             "any other core with any other generator."
         )
     if policy.encoder.last_token != policy.core.last_token:

@@ -140,7 +140,7 @@ class RobotSpec:
         """
         require(isinstance(values, Mapping), where, "a mapping of keys to values", values)
         if "cameras" not in values:
-            raise UserError(f"Missing key {where}.cameras: list them, or give [] where there are none.")
+            raise UserError(f"Missing key {where}.cameras: list its cameras, or [] for none.")
         cameras = values["cameras"]
         require(isinstance(cameras, list | tuple), f"{where}.cameras", "a list", cameras)
         seen = tuple(

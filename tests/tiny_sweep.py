@@ -53,7 +53,7 @@ def launch(arguments: list[str], directory: Path, **environment: str) -> subproc
 def main(config: dict[str, Any]) -> None:
     from imfvla import experiment
     from imfvla.evaluation import evaluate
-    from imfvla.recording import Recordings
+    from imfvla.sources.mcap import McapSource
 
     if config["seed"] == 13:
         raise UserError("seed 13 is bad.")
@@ -70,7 +70,7 @@ def main(config: dict[str, Any]) -> None:
 
     with (
         mock.patch.object(
-            experiment, "ensure_demonstrations", lambda config: Recordings.of(config["demos"]["directory"])
+            experiment, "open_source", lambda config: McapSource.of(config["demos"]["directory"])
         ),
         mock.patch.object(
             experiment,

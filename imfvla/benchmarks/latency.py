@@ -12,6 +12,7 @@ from imfvla.environment import Environment
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
+from imfvla.resample import resample
 from imfvla.types import Observation
 
 FEWEST_CALLS = 50  # of a sampler with many steps
@@ -30,9 +31,12 @@ def measure_latency(
     """
     env.reset(seed=0)
     obs = policy.horizon.obs
-    images, states = [np.stack(list(env.look().values()))] * obs, [env.state()] * obs
+    seen = env.look()
+    pictures = [seen[view] for view in policy.views]
+    images, states = [pictures] * obs, [env.state()] * obs
+    fitted = np.stack([resample(picture, policy.image_size) for picture in pictures])
     observation = Observation(
-        images=torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0),
+        images=torch.from_numpy(np.stack([fitted] * obs)).permute(0, 1, 4, 2, 3).unsqueeze(0),
         state=torch.from_numpy(np.stack(states)).unsqueeze(0),
         instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
     )
