@@ -29,7 +29,9 @@ def read_frames(path: Path, times_s: np.ndarray, fps: float, size: tuple[int, in
                 raise misfit(path, "its streams", "a video", "none", DOWNLOAD)
             stream = container.streams.video[0]
             if stream.codec_context is None:
-                raise misfit(path, "its codec", "one that av decodes (others are not supported)", "another", DOWNLOAD)
+                raise misfit(
+                    path, "its codec", "one that av decodes (others are not supported)", "another", DOWNLOAD
+                )
             found = (stream.codec_context.height, stream.codec_context.width)
             if found != size:
                 raise misfit(
