@@ -111,7 +111,17 @@ MAY_IMPORT = {
     "recording": {"documents", "environment", "episode", "files", "robot", "tasks"},
     "reporting": {"documents", "episode", "files", "options", "protocol", "robot", "run_directory"},
     "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
-    "sources": {"collection", "episode", "options", "recording", "robot", "same_robot", "tasks"},
+    "sources": {
+        "collection",
+        "documents",
+        "episode",
+        "files",
+        "options",
+        "recording",
+        "robot",
+        "same_robot",
+        "tasks",
+    },
     "modes": {
         "torch",
         "collection",
