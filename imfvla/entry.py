@@ -69,12 +69,12 @@ def _run(
     if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
         known.overrides.append("hydra/job_logging=disabled")
     arguments = [*flags, *known.overrides]  # Hydra rejects overrides on both sides of a flag
+    more = Path(known.config_dir).absolute() if known.config_dir else None
     try:
         with _hydra_raises(arguments):
             refuse_ignored(known, is_sweep)
             if usage and is_bare:
                 raise UserError(usage())
-            more = Path(known.config_dir).absolute() if known.config_dir else None
             composition.refuse_added_keys(job.config_name, known.overrides, more)
             if is_sweep:
                 failures = run_sweep(job, known.overrides, is_finished, more)
@@ -82,7 +82,7 @@ def _run(
                 _run_once(job)
                 failures = [job.failure] if job.failure else []
     except (HydraException, OmegaConfBaseException) as error:
-        raise composition.explain(error, job.config_name, known.overrides) from error
+        raise composition.explain(error, job.config_name, known.overrides, more) from error
     except (OSError, ValueError) as error:  # ours, and of what Hydra itself writes: directories, train.log
         if (known_error := as_user_error(error, REMEDIES | WHERE_MISSING)) is None:
             raise
@@ -91,7 +91,7 @@ def _run(
 
 
 def _run_once(job: Job) -> None:
-    path = str(composition.CONFIG_DIRECTORY)
+    path = str(composition.config_directory())
     hydra.main(config_path=path, config_name=job.config_name, version_base=composition.VERSION_BASE)(job)()
 
 

@@ -12,13 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import write_episode
 
-from imfvla.composition import compose, run_name
+from imfvla.composition import compose
 from imfvla.construction import construct, refuse_foreign_target
 from imfvla.errors import UserError
 from imfvla.experiment import run_experiment
 from imfvla.policy import build_policy
 from imfvla.recording import McapSink, read_episode
 from imfvla.run_directory import RunDirectory
+from imfvla.run_names import run_name
 
 ROOT = Path(__file__).resolve().parent.parent
 TREE = subprocess.run(

@@ -101,7 +101,17 @@ MAY_IMPORT = {
     },
     "tasks": {"mujoco", "dm_control", "episode", "gl", "options", "views"},
     "recording": {"documents", "episode", "files"},
-    "reporting": {"documents", "episode", "files", "options", "protocol", "run_directory"},
+    "reporting": {
+        "assets",
+        "documents",
+        "episode",
+        "files",
+        "options",
+        "protocol",
+        "run_directory",
+        "run_names",
+    },
+    "run_names": {"run_directory"},
     "figures": {"documents", "reporting"},
     "modes": {
         "torch",

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from imfvla.assets import folder
 from imfvla.documents import ChosenLoader, read_yaml
 from imfvla.errors import UserError
 from imfvla.options import build, require, suggestion
@@ -21,8 +22,9 @@ from imfvla.reporting.paper import (
     paper_rows,
 )
 from imfvla.run_directory import LAST, step_of
+from imfvla.run_names import run_key, run_name
 
-PATH = Path(__file__).resolve().parents[2] / "experiments" / "tables.yaml"
+PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
 _LINE = "__line__"
@@ -57,7 +59,7 @@ class TableRow:
     @property
     def run(self) -> str:
         """Name of the run directory below that of the experiment, its seed apart; "" for "default"."""
-        return run_key(",".join(sorted(self.overrides)))
+        return run_key(run_name(self.overrides))
 
     @property
     def label(self) -> str:
@@ -114,12 +116,6 @@ class _ComparisonEntry:
     baseline: str
     of: str
     operation: str
-
-
-def run_key(directory: str) -> str:
-    """What the name of a run directory says besides the training seed: "" for "default", "seed=1" and the like."""
-    parts = [part for part in directory.split(",") if not re.fullmatch(r"seed=\d+|default", part)]
-    return re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", ",".join(parts))
 
 
 @cache

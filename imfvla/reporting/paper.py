@@ -3,9 +3,10 @@
 import csv
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
-DIRECTORY = Path(__file__).resolve().parents[2] / "experiments" / "paper"
+from imfvla.assets import folder
+
+DIRECTORY = folder("experiments") / "paper"
 TABLES = (1, 2)  # rows of methods; table 3 compares them
 TITLES = {
     1: "Table 1: socket peg insertion",

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from imfvla.composition import run_name
 from imfvla.errors import UserError
-from imfvla.reporting.mapping import PATH, read_mapping, run_key
+from imfvla.reporting.mapping import PATH, read_mapping
+from imfvla.run_names import run_key, run_name
 
 TEXT = PATH.read_text()
 
@@ -37,12 +37,6 @@ def test_evaluations_that_the_paper_prints_are_those_of_the_rows():
 def test_a_checkpoint_is_a_share_of_the_training():
     first, second = read_mapping().rows[:2]
     assert (first.step(6000), second.step(6000)) == (2000, 6000)
-
-
-def test_the_training_seed_is_no_part_of_what_a_directory_says():
-    assert run_key("default") == run_key("seed=2") == ""
-    assert run_key("core=standard,seed=2") == "core=standard"
-    assert run_key("core/conditioning=adaln") == "core-conditioning=adaln"
 
 
 @pytest.mark.parametrize(
