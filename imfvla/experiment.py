@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from imfvla.collection import check_demonstrations, ensure_demonstrations
-from imfvla.composition import EXECUTION_KEYS
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.gl import select_gl_backend
@@ -20,7 +19,7 @@ from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
 from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.table_row import print_row
-from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions

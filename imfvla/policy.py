@@ -115,7 +115,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
             chunks=ChunkFrame(config["action_frame"], horizon.pred, config["action_dim"]),
             encoder=construct(config["encoder"], "encoder"),
             core=construct(config["core"], "core"),
-            generator=construct(config["generator"], "generator"),
+            generator=construct(config["generator"], "generator", Generator),
         )
     except KeyError as error:
         raise UserError(
@@ -123,11 +123,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         ) from None
     except UserError:
         raise
-    except Exception as error:  # hydra wraps what a constructor raises
-        reason = error.__cause__ or error
-        if isinstance(reason, UserError):
-            raise reason from None
-        raise UserError(f"the configured policy cannot be built: {reason_of(reason)}") from error
+    except Exception as error:  # parts that a constructor took can be unusable together
+        raise UserError(f"the configured policy cannot be built: {reason_of(error)}") from error
     wanted, found = policy.generator.core_interface, policy.core.interface
     if wanted != found:
         raise UserError(

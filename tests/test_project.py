@@ -87,7 +87,8 @@ MAY_IMPORT = {
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn", "options"},
     "chunks": {"torch", "episode", "nn", "statistics"},
-    "construction": {"torch", "options"},
+    "components": set(),
+    "construction": {"components", "options"},
     "policy": {
         "torch",
         "chunks",
