@@ -8,7 +8,6 @@ import inspect
 import re
 import types
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from hydra.errors import InstantiationException
@@ -75,11 +74,18 @@ def _check_arguments(target: type, part: Mapping[str, Any], key: str) -> None:
     hints: dict[str, Any] = {}
     # Base classes first.
     for cls in reversed(target.__mro__[:-1]):
-        with suppress(NameError):  # types that another package imports only for its checker
-            hints |= get_type_hints(cls.__init__, include_extras=True)
+        hints |= _hints_of(cls.__init__)
     for argument, value in part.items():
         if _is_checked(hints.get(argument)):
             convert(value, hints[argument], f"{key}.{argument}")
+
+
+def _hints_of(constructor: Any) -> dict[str, Any]:
+    try:
+        return get_type_hints(constructor, include_extras=True)
+    except Exception:  # of texts that name what another package imports only for its type checker
+        found = getattr(constructor, "__annotations__", {})
+        return {name: hint for name, hint in found.items() if not isinstance(hint, str)}
 
 
 def _is_checked(hint: Any) -> bool:
