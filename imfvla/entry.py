@@ -19,7 +19,7 @@ from imfvla import composition
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
 from imfvla.command_line import in_hydras_words, multiplies, refuse_ignored
 from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
-from imfvla.jobs import Failure, Job
+from imfvla.jobs import Failure, HydraJob
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
 
@@ -42,7 +42,7 @@ def entry_point(
         @wraps(function)
         def main(argv: Sequence[str] | None = None) -> None:
             arguments = list(sys.argv[1:] if argv is None else argv)
-            code = _run(Job(function, config_name), arguments, is_finished, usage)
+            code = _run(HydraJob(function, config_name), arguments, is_finished, usage)
             if code:
                 sys.exit(code)
 
@@ -58,7 +58,7 @@ def output_directory() -> Path:
 
 @as_command
 def _run(
-    job: Job, arguments: list[str], is_finished: IsFinished | None, usage: Callable[[], str] | None
+    job: HydraJob, arguments: list[str], is_finished: IsFinished | None, usage: Callable[[], str] | None
 ) -> int:
     composition.register_resolvers()
     known = get_args_parser().parse_intermixed_args(arguments)
@@ -90,7 +90,7 @@ def _run(
     return _report(failures)
 
 
-def _run_once(job: Job) -> None:
+def _run_once(job: HydraJob) -> None:
     path = str(composition.config_directory())
     hydra.main(config_path=path, config_name=job.config_name, version_base=composition.VERSION_BASE)(job)()
 

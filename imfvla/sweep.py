@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
 from imfvla.errors import UserError
-from imfvla.jobs import Failure, Job
+from imfvla.jobs import Failure, HydraJob
 from imfvla.options import build, is_whole, require
 from imfvla.progress import Progress
 from imfvla.reporting.mapping import LAST, TableRow, read_mapping
@@ -66,7 +66,7 @@ def names_a_sweep(overrides: Sequence[str]) -> bool:
 
 
 def run_sweep(
-    job: Job, overrides: Sequence[str], is_finished: IsFinished | None, more: Path | None = None
+    job: HydraJob, overrides: Sequence[str], is_finished: IsFinished | None, more: Path | None = None
 ) -> list[Failure]:
     """Runs the jobs that are not finished and returns what failed; one failure stops no other job.
 
