@@ -87,6 +87,7 @@ MAY_IMPORT = {
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn", "options"},
     "chunks": {"torch", "episode", "nn", "statistics"},
+    "assets": set(),
     "components": set(),
     "construction": {"components", "options"},
     "policy": {

@@ -94,6 +94,25 @@ def test_the_script_of_a_command_takes_configs_of_ones_own(unpacked, tmp_path, b
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+def test_its_results_name_no_commit_of_the_project_that_it_is_installed_in(unpacked, tmp_path):
+    commit = [
+        "-c",
+        "user.name=a",
+        "-c",
+        "user.email=a",
+        "commit",
+        "--quiet",
+        "--allow-empty",
+        "-m",
+        "of another project",
+    ]
+    for arguments in (["init", "--quiet"], commit):
+        subprocess.run(["git", "-C", str(unpacked.parent), *arguments], check=True)
+    script = "import json; from imfvla.fingerprint import code_version; print(json.dumps(code_version()))"
+    version = json.loads(run(unpacked, tmp_path, "-c", script).stdout)
+    assert (version["commit"], version["dirty"]) == (None, None)
+
+
 def test_a_report_of_an_empty_directory_says_what_to_do(unpacked, tmp_path):
     done = run(unpacked, tmp_path, "-m", "imfvla.report")
     assert (done.returncode, done.stdout) == (2, "")

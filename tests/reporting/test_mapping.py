@@ -1,6 +1,7 @@
 """Rows to runs: the file of the repository, and every way in which such a file may be wrong."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,15 @@ def test_rows_are_answered_by_the_directories_that_training_makes():
     for row in read_mapping().rows:
         assert row.run == run_key(run_name(row.overrides))
         assert row.run == run_key(run_name([*row.overrides, "seed=3", "evaluation.nfe=[1]"]))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [("observation.views=[front,top]",), ("+core/conditioning=adaln",), (f"core.text={'x' * 130}",)],
+)
+def test_a_row_of_lists_groups_and_long_values_is_answered_too(overrides):
+    row = replace(read_mapping().rows[0], overrides=overrides)
+    assert row.run == run_key(run_name([*overrides, "seed=3"]))
 
 
 def test_three_rivals_in_each_table_beside_the_paper_s_rows():
