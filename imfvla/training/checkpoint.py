@@ -138,9 +138,11 @@ def load_weights(policy: nn.Module, path: Path) -> None:
 
 def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
     """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients."""
-    path = run.policy_weights(step)
+    step = run.weights_step(step)
     policy = build_policy(run.config(), statistics=None)
-    load_weights(policy, path)
+    if policy.has_stages:
+        policy.begin_step(step - 1, run.training_steps())  # the last one that these weights have learned from
+    load_weights(policy, run.policy_weights(step))
     return policy.eval().requires_grad_(False)
 
 
