@@ -27,17 +27,30 @@ MAX_REASON = 200  # characters of what torch says
 CHECKED = (bool, int, float, str, types.NoneType)
 
 
-def construct(part: Mapping[str, Any], key: str, contract: type | None = None) -> Any:
+def construct(part: Mapping[str, Any], key: str, contract: type | None = None, **handed: Any) -> Any:
     """The object that `part`, a resolved config under `key`, describes; nested parts are built first.
 
-    Raises UserError, before anything is built, where a `_target_` is not what `allowed_class` takes, where a value
-    violates the types of the constructor or their `Limit`, or where a text is an interpolation, which would read the
-    environment; then where a constructor raises, or the object lacks what the Protocol `contract` promises.
+    Those of the `handed` values that its constructor names are given to it, such as the sizes that a robot decides.
+
+    Raises UserError, before anything is built, where `part` states another value than the one that is handed, where a
+    `_target_` is not what `allowed_class` takes, where a value violates the types of the constructor or their `Limit`,
+    or where a text is an interpolation, which would read the environment; then where a constructor raises, or the
+    object lacks what the Protocol `contract` promises.
     """
     if not isinstance(part, Mapping) or "_target_" not in part:
         raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
+    checked = _checked(part, key, 0)
+    for name in handed.keys() & part.keys():
+        require(
+            part[name] == handed[name],
+            f"{key}.{name}",
+            f"{handed[name]!r}, as robot and observation have it, or left out",
+            part[name],
+        )
+    arguments = _arguments_of(checked["_target_"])
+    taken = {name: value for name, value in handed.items() if name in arguments}
     try:
-        built = instantiate(_checked(part, key, 0), _convert_="all")
+        built = instantiate(checked | taken, _convert_="all")
     except InstantiationException as error:
         reason = error.__cause__ or error
         if isinstance(reason, UserError):
@@ -67,6 +80,13 @@ def allowed_class(target: Any, key: str) -> type:
 def reason_of(error: BaseException) -> str:
     """The message of an error, without the C++ stack that torch appends."""
     return (str(error).splitlines() or [type(error).__name__])[0][:MAX_REASON]
+
+
+def _arguments_of(target: type) -> set[str]:
+    """The names of what the constructor of a class takes, its base classes' included."""
+    return {
+        argument for cls in target.__mro__[:-1] for argument in inspect.signature(cls.__init__).parameters
+    }
 
 
 def _check_arguments(target: type, part: Mapping[str, Any], key: str) -> None:

@@ -6,25 +6,21 @@ from typing import Any, Protocol
 
 import numpy as np
 
-CONTROL_HZ = 50
-STATE_DIM = 16
-ACTION_DIM = 16
-ACTION_NAMES = tuple(
-    f"{arm}/{name}" for arm in ("left", "right") for name in (*(f"joint_{i}" for i in range(1, 8)), "gripper")
-)
+from imfvla.environment import Environment
+from imfvla.robot import RobotSpec
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:
     """What is known when an episode begins."""
 
-    task: str  # "socket" | "transfer" | "combined"
+    task: str
     kind: str  # "demonstration" | "rollout"
     seed: int  # passed to reset; draws the start state
     start_digest: str  # hex digest of the start state
     instruction: str
-    views: tuple[str, ...]
-    image_size: tuple[int, int]  # (H, W) [px]
+    views: tuple[str, ...]  # cameras that the actor sees
+    robot: RobotSpec
     config: Mapping[str, Any]  # attached to the recording in full
     metadata: Mapping[str, Any] = field(default_factory=dict)  # expert style, policy name, nfe, ...
 
@@ -72,14 +68,14 @@ class EpisodeResult:
 class Actor(Protocol):
     """Chooses actions. A demonstrator may read the simulator behind `env`; a policy only looks through its cameras."""
 
-    def reset(self, env: Any, seed: int) -> None: ...
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision: ...
+    def reset(self, env: Environment, seed: int) -> None: ...
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision: ...
 
 
 class Sink(Protocol):
     """Receives an episode as it happens: `begin`, each `step`, then `end` or, after an exception, `abort`."""
 
-    def begin(self, env: Any, info: EpisodeInfo) -> None: ...
-    def step(self, env: Any, step: Step) -> None: ...
+    def begin(self, env: Environment, info: EpisodeInfo) -> None: ...
+    def step(self, env: Environment, step: Step) -> None: ...
     def end(self, result: EpisodeResult) -> None: ...
     def abort(self) -> None: ...

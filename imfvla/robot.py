@@ -6,13 +6,14 @@ file holds a number of a robot. Shapes: S state channels, A action channels.
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from imfvla.errors import UserError
-from imfvla.options import build, part_of, require
+from imfvla.options import build, require
 
 MAX_CHANNELS = 1000
 MAX_CAMERAS = 64
@@ -61,6 +62,14 @@ class RobotSpec:
             repeated = sorted({name for name in plain if plain.count(name) > 1})
             require(
                 not repeated, f"robot.{key}", "names that all differ", f"{', '.join(repeated)} more than once"
+            )
+            groups = {name[:place] for name in plain for place, sign in enumerate(name) if sign == "/"}
+            shared = sorted(groups & set(plain))
+            require(
+                not shared,
+                f"robot.{key}",
+                "channels that are no group of others",
+                f"{', '.join(shared)} as both",
             )
         for key in ("relative_to", "action_min", "action_max"):
             count = len(getattr(self, key))
@@ -129,7 +138,10 @@ class RobotSpec:
 
         Raises UserError naming what is missing, unknown or of another type.
         """
-        cameras = part_of({where: values}, f"{where}.cameras")
+        require(isinstance(values, Mapping), where, "a mapping of keys to values", values)
+        if "cameras" not in values:
+            raise UserError(f"Missing key {where}.cameras: list its cameras, or [] for none.")
+        cameras = values["cameras"]
         require(isinstance(cameras, list | tuple), f"{where}.cameras", "a list", cameras)
         seen = tuple(
             build(Camera, camera, f"{where}.cameras[{number}]") for number, camera in enumerate(cameras)

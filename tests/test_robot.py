@@ -44,6 +44,10 @@ def test_a_channel_is_a_name_and_a_unit(channel, name, unit):
             {"state": ("a [rad]", "a [m]", "b")},
             "robot.state must be names that all differ, found 'a more than once'",
         ),
+        (
+            {"state": ("a [rad]", "a/b [rad]", "c")},
+            "robot.state must be channels that are no group of others, found 'a as both'",
+        ),
         ({"relative_to": (1,)}, "robot.relative_to must be 2 values"),
         (
             {"relative_to": (3, None)},
@@ -71,10 +75,15 @@ def test_a_contradiction_is_named(changes, named):
         (SPEC.to_json() | {"speed": 1}, "Unknown key robot.speed"),
     ],
 )
-def test_a_wrong_file_is_named(values, named):
+@pytest.mark.parametrize("where", ["robot", "task.robot"])
+def test_a_wrong_file_is_named(values, named, where):
     with pytest.raises(UserError) as error:
-        RobotSpec.from_json(values)
-    assert named in str(error.value)
+        RobotSpec.from_json(values, where)
+    assert named.replace("robot", where) in str(error.value)
+
+
+def test_a_part_of_a_config_is_read():
+    assert RobotSpec.from_json(SPEC.to_json(), "task.robot") == SPEC
 
 
 def test_an_unknown_camera_is_answered_with_the_known_ones():
