@@ -1,5 +1,6 @@
 """Classes of other packages: found by their entry point alone, trained like ours, refused by name otherwise."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -10,12 +11,16 @@ import tiny_sweep
 
 from imfvla import components
 from imfvla.construction import allowed_class, construct
+from imfvla.environments import environment_of
 from imfvla.errors import UserError
 from imfvla.fingerprint import fingerprint
 from imfvla.policy import build_policy
 from imfvla.run_directory import DONE, RunDirectory
+from imfvla.sources import EpisodeSource
+from imfvla.sources.opening import open_source
 
-EXAMPLE = Path(__file__).resolve().parent / "example_package"
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLE = ROOT / "tests" / "example_package"
 MODULE = """
 import os
 from os import system
@@ -136,34 +141,40 @@ def test_arguments_are_checked_and_a_contract_is_held(mark):
         UserError, match=r"core cannot be built from outside_parts\.Part: .*argument 'height'"
     ):
         construct({"_target_": "outside_parts.Part", "height": 1}, "core")
-    from imfvla.sources import EpisodeSource
-
     with pytest.raises(
         UserError, match=r"demos must offer what .*EpisodeSource says, found .*Part, which lacks robot"
     ):
         construct({"_target_": "outside_parts.Part", "size": 1}, "demos", EpisodeSource)
 
 
-def test_a_generator_of_another_package_is_trained_and_its_run_needs_that_package(
-    installed, synthetic_demonstrations, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("PYTHONPATH", str(installed))
-    places = "hydra.searchpath=[pkg://imfvla_example.conf]"
+def test_a_task_its_data_and_a_generator_of_another_package_are_trained_and_evaluated(installed, tmp_path):
+    paths = os.pathsep.join([str(installed), str(ROOT)])
     command = [
-        places,
-        "+sweep=denoisers",
-        *tiny_sweep.OVERRIDES,
-        f"demos.directory={synthetic_demonstrations}",
+        sys.executable,
+        "-m",
+        "imfvla.train",
+        "hydra.searchpath=[pkg://imfvla_example.conf]",
+        "+sweep=points",
     ]
-    done = tiny_sweep.launch(command, tmp_path)
+    done = subprocess.run(
+        [*command, *tiny_sweep.OVERRIDES],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    runs = sorted((tmp_path / "runs" / "socket_denoiser").iterdir())
+    runs = sorted((tmp_path / "runs" / "point").iterdir())
+    assert "Warning" not in done.stderr
     assert len(runs) == 2
     for path in runs:
         run = RunDirectory(path)
         assert run.status()["state"] == DONE
-        assert len(list(path.glob("rollouts/*/episodes.jsonl"))) == 1
+        assert run.config()["robot"]["control_hz"] == 10
+        assert len(list(path.glob("rollouts/*/*.mcap"))) >= 1
+        # Where the package is not installed, as here:
         with pytest.raises(
             UserError, match=r"generator\._target_ must name .* found 'imfvla_example\.denoiser"
         ):
-            build_policy(run.config())  # where the package is not installed, as here
+            build_policy(run.config())
+        with pytest.raises(UserError, match=r"task\._target_ must name .* found 'imfvla_example\.world"):
+            environment_of(run.config())
+        with pytest.raises(UserError, match=r"demos\._target_ must name .* found 'imfvla_example\.world"):
+            open_source(run.config())

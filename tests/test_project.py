@@ -81,7 +81,7 @@ def test_commands_in_documents_compose_and_build(command):
 # What a package may import of imfvla beside itself and `errors`, and which of the heavy packages.
 MAY_IMPORT = {
     "environment": {"robot"},
-    "environments": {"environment", "gymnasium_env", "options", "tasks", "views"},
+    "environments": {"construction", "environment", "gymnasium_env", "options", "tasks", "views"},
     "episode": {"environment", "robot"},
     "horizon": set(),
     "protocol": {"options"},
@@ -124,7 +124,16 @@ MAY_IMPORT = {
     },
     "run_names": {"run_directory"},
     "figures": {"documents", "reporting", "robot_of"},
-    "sources": {"collection", "episode", "options", "recording", "robot", "same_robot", "tasks"},
+    "sources": {
+        "collection",
+        "construction",
+        "episode",
+        "options",
+        "recording",
+        "robot",
+        "same_robot",
+        "tasks",
+    },
     "modes": {
         "torch",
         "collection",
