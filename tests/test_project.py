@@ -123,7 +123,7 @@ MAY_IMPORT = {
         "run_names",
     },
     "run_names": {"run_directory"},
-    "figures": {"documents", "reporting", "robot_of"},
+    "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
     "sources": {
         "collection",
         "construction",

@@ -23,6 +23,7 @@ def source_kind(config: Mapping[str, Any]) -> str:
     Configs from before these keys are of the scripted expert.
     """
     demos = part_of(config, "demos")
+    require(isinstance(demos, Mapping), "demos", "a mapping of keys to values", demos)
     if "_target_" in demos:
         return COMPONENT
     kind = demos.get("source", SCRIPTED)

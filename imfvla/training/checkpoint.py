@@ -145,10 +145,10 @@ def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
     Raises UserError where the weights do not fit the run's config, or were trained for another robot.
     """
     step = run.weights_step(step)
-    path = run.policy_weights(step)
     policy = build_policy(run.config(), statistics=None)
     if policy.has_stages:
         policy.begin_step(step - 1, run.training_steps())  # the last one that these weights have learned from
+    path = run.policy_weights(step)
     _refuse_other_robot(policy, path)
     load_weights(policy, path)
     return policy.eval().requires_grad_(False)
