@@ -24,7 +24,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from imfvla.assets import folder
+from imfvla.assets import folder, install_command
 from imfvla.errors import UserError
 from imfvla.options import require, suggestion
 from imfvla.run_names import key_of, run_name
@@ -113,8 +113,7 @@ def explain(
         if group == "hydra/launcher":
             return UserError(
                 f"Unknown launcher {choice!r}: known here are {', '.join(options)}; submitit_slurm and submitit_local "
-                "come with pip install 'imfvla[slurm]', ray with pip install 'imfvla[ray]'; in a clone, with "
-                "pip install -e '.[slurm]' and pip install -e '.[ray]'."
+                f"come with {install_command('slurm')}, ray with {install_command('ray')}."
             )
         return UserError(
             f"Unknown {group} {choice!r}{suggestion(choice, options)}: there are {', '.join(options)}."

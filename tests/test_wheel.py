@@ -15,10 +15,11 @@ BESIDE = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "experiments/tab
 COMPOSE = """
 import json
 import imfvla
+from imfvla.assets import install_command
 from imfvla.composition import compose
 from imfvla.reporting.mapping import read_mapping
 config = compose("train", ["+exp=transfer_dwell"])
-print(json.dumps([imfvla.__file__, config["name"], len(read_mapping().rows)]))
+print(json.dumps([imfvla.__file__, config["name"], len(read_mapping().rows), install_command("slurm")]))
 """
 
 
@@ -77,9 +78,10 @@ def test_it_composes_its_own_configs_from_anywhere(unpacked, tmp_path):
     (tmp_path / "conf").mkdir()  # somebody else's
     done = run(unpacked, tmp_path, "-c", COMPOSE)
     assert done.returncode == 0, done.stderr
-    file, name, rows = json.loads(done.stdout)
+    file, name, rows, command = json.loads(done.stdout)
     assert Path(file).is_relative_to(unpacked)
     assert (name, rows > 18) == ("transfer_dwell", True)
+    assert command == "pip install 'imfvla[slurm]'"
 
 
 @pytest.mark.parametrize("by", [["--config-dir", "mine"], ["hydra.searchpath=[file://mine]"]])
