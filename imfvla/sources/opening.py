@@ -12,7 +12,7 @@ KINDS = (SCRIPTED, "mcap", "lerobot", "ros2", "hdf5")
 SHARED = (
     "source",
     "frames_directory",
-)  # keys of `demos` that every kind has, and that its module is not given
+)  # keys of `demos` that every kind has; a kind's module is not given them
 
 
 def source_kind(config: Mapping[str, Any]) -> str:
