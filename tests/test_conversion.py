@@ -47,7 +47,7 @@ def test_from_recordings_to_lerobot(data_set, tmp_path):
     main(
         [
             "from=mcap",
-            f"from.directory={tmp_path / 'recordings'}",
+            f"from.path={tmp_path / 'recordings'}",
             "to=lerobot",
             f"to.path={back}",
             "to.pictures=png",
@@ -94,11 +94,10 @@ def test_every_source_has_its_options_in_one_place():
     for kind in conversion.READERS:
         if not (CONFIG_DIRECTORY / "demos" / f"{kind}.yaml").exists():
             continue  # comes with the source of recordings
-        place = "directory" if kind == "mcap" else "path"
         given = {"control_hz": 1, "state": "x", "action": "[x]", "layout": "act", "instruction": "x"}
         demos = yaml.safe_load((CONFIG_DIRECTORY / "demos" / f"{kind}.yaml").read_text(encoding="utf-8"))
         given = [f"from.{key}={value}" for key, value in given.items() if demos.get(key) == "???"]
-        config = compose("convert", [f"from={kind}", "to=mcap", f"from.{place}=x", "to.path=y", *given])
+        config = compose("convert", [f"from={kind}", "to=mcap", "from.path=x", "to.path=y", *given])
         assert config["from"].keys() == demos.keys()
         assert config["from"]["source"] == kind
 

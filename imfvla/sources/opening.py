@@ -14,7 +14,7 @@ COMPONENT = "component"  # a class that another package registers: demos._target
 SHARED = (
     "source",
     "frames_directory",
-)  # keys of `demos` that every kind has, and that its module is not given
+)  # keys of `demos` that every kind has; a kind's module is not given them
 
 
 def source_kind(config: Mapping[str, Any]) -> str:
