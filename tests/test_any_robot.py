@@ -15,7 +15,7 @@ from imfvla.training.checkpoint import load_policy
 
 SHAPES = ((7, 7), (8, 9), (14, 14), (20, 23))  # actions, states
 TINY = [
-    "task=none", "demos=mcap", "demos.directory=none", "task.held_out=1", "observation.image_size=[16,16]",
+    "task=none", "demos=mcap", "demos.path=none", "task.held_out=1", "observation.image_size=[16,16]",
     "size.width=20", "size.heads=2", "size.depth=1", "horizon.pred=8", "horizon.exec=4", "training.batch_size=2",
     "training.steps=2", "training.checkpoints=1", "training.threads=1", "evaluation.nfe=[1,2]",
 ]  # fmt: skip
