@@ -121,6 +121,7 @@ MAY_IMPORT = {
         "instruction",
         "policy",
         "progress",
+        "protocol",
         "recording",
         "reporting",
         "robot",
