@@ -31,7 +31,7 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
         [
             "parts=[simulation,training,latency]", "at_scale=cpu",
             "experiments=[transfer_ph32_exec16]", "nfe=[1,3]", "training_steps=1", "latency_calls=5",
-            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in TOY)}]",
+            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in (*TOY, 'generator=imf_plain'))}]",
         ]
     )  # fmt: skip
     out = capsys.readouterr().out
