@@ -81,7 +81,8 @@ def test_a_robot_of_any_shape_is_trained_stored_loaded_and_moved(
 
 
 @pytest.mark.parametrize(
-    "core", ["core=act generator=act evaluation.nfe=[1]", "core=smolvla encoder=smolvla/cpu"]
+    "core",
+    ["core=act generator=act evaluation.nfe=[1]", "core=smolvla encoder=smolvla/cpu generator=smolvla"],
 )
 def test_other_cores_take_their_sizes_from_the_robot_too(trained, core):
     robot = robot_of_size(8, 9, num_cameras=2)
