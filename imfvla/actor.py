@@ -4,21 +4,24 @@ Shapes: To observed steps, V views, H W pixels, S state, Tp predicted steps, A a
 """
 
 import time
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from imfvla.ensemble import TemporalEnsemble
+from imfvla.environment import Environment
 from imfvla.episode import Decision
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.protocol import USUAL_NOISE
+from imfvla.resample import resample
 from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
+from imfvla.same_robot import refuse_other_robot
 from imfvla.types import Observation
 
-# A sound policy exceeds the joint limits slightly and is clipped; one that exceeds them by this many range
+# A sound policy exceeds the limits slightly and is clipped; one that exceeds them by this many range
 # widths has diverged, and clipping would only hide it.
 FAR = 10.0
 
@@ -47,20 +50,29 @@ class ChunkActor:
         self._noise_seed, self._noise_scale = noise_seed, noise_scale
         self._device = torch.device(device)
 
-    def reset(self, env: Any, seed: int) -> None:
-        """Forgets the last episode. `env` has the instruction and the limits of the actions [rad], [0, 1]."""
-        spec = env.action_spec()
-        self._minimum, self._maximum = (
-            np.broadcast_to(limit, spec.shape).astype(np.float32) for limit in (spec.minimum, spec.maximum)
+    def reset(self, env: Environment, seed: int) -> None:
+        """Forgets the last episode. `env` has the instruction, and the robot with the limits of its actions.
+
+        Raises UserError where that is another robot than the policy's.
+        """
+        refuse_other_robot(
+            self._policy.robot,
+            env.robot,
+            self._policy.views,
+            of="the policy",
+            where=f"The environment {env.name}",
+            remedy="Choose a policy that was trained for this robot, or the environment that it was trained for.",
         )
+        self._minimum = np.array(env.robot.action_min, np.float32)
+        self._maximum = np.array(env.robot.action_max, np.float32)
         self._instruction = torch.from_numpy(tokenize(env.instruction)).unsqueeze(0).to(self._device)
         self._seed = seed
-        self._images: dict[int, np.ndarray] = {}
+        self._images: dict[int, list[np.ndarray]] = {}
         self._states: dict[int, np.ndarray] = {}
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
         """The action of `step`; looks and replans where the horizon says so.
 
         Raises:
@@ -69,7 +81,7 @@ class ChunkActor:
         images = chunk = inference_ms = None
         if self._horizon.is_observed(step):
             images = env.look()
-            self._images[step] = np.stack(list(images.values()))
+            self._images[step] = [images[view] for view in self._policy.views]
             self._states[step] = state
         if self._horizon.is_decision(step):
             steps = self._horizon.observed_steps(step)
@@ -90,14 +102,16 @@ class ChunkActor:
 
     @torch.inference_mode()
     def plan(
-        self, images: list[np.ndarray], states: list[np.ndarray], replanning: int
+        self, images: Sequence[Sequence[np.ndarray]], states: Sequence[np.ndarray], replanning: int
     ) -> tuple[np.ndarray, float]:
-        """From the images of To steps, uint8 (V, H, W, 3), and states, float32 (S,), to a chunk.
+        """From the V pictures of each of To steps, uint8 (H, W, 3) of any size, and states, float32 (S,), to a chunk.
 
         Returns the chunk, float32 (Tp, A), and the time from these arrays to that one [ms].
         """
         began = time.perf_counter()
-        pixels = torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0)
+        size = self._policy.image_size
+        fitted = np.stack([[resample(picture, size) for picture in step] for step in images])
+        pixels = torch.from_numpy(fitted).permute(0, 1, 4, 2, 3).unsqueeze(0)
         observation = Observation(
             images=pixels.to(self._device),
             state=torch.from_numpy(np.stack(states)).unsqueeze(0).to(self._device),

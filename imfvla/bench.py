@@ -131,14 +131,16 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
 
     from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency
-    from imfvla.benchmarks.simulation import make_environment, measure_demonstrations, measure_simulation
+    from imfvla.benchmarks.simulation import measure_demonstrations, measure_simulation
     from imfvla.benchmarks.training import measure_training
+    from imfvla.environments import environment_of
     from imfvla.policy import build_policy
     from imfvla.rehearsal import build_unfitted
+    from imfvla.sources.mcap import McapSource
     from imfvla.training.data import prepare_windows
 
     parts, figures = config["parts"], {}
-    env = make_environment(composed)
+    env = environment_of(composed)
     if "simulation" in parts:
         figures["simulation"] = measure_simulation(env)
     if "simulation" in parts or "training" in parts:
@@ -146,10 +148,11 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
         figures.setdefault("simulation", {}).update(demonstrating)
     torch.manual_seed(0)
     if "training" in parts:
-        policy = build_policy(composed, prepare_windows(composed, demonstrations).statistics())
+        source = McapSource(demonstrations)
+        policy = build_policy(composed, prepare_windows(composed, source).statistics())
         with threads(torch.get_num_threads()):
             figures["training"] = measure_training(
-                composed, policy, demonstrations, scratch / "run", config["training_steps"]
+                composed, policy, source, scratch / "run", config["training_steps"]
             )
     else:
         policy = build_unfitted(composed)

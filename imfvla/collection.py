@@ -10,14 +10,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
+from imfvla import tasks
 from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
+from imfvla.environments import BIMANUAL, KIND, environment_of, kind_of
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
-from imfvla.options import Limit, build, part_of, within
+from imfvla.options import Limit, at_least, build, one_of, part_of, require, within
 from imfvla.progress import Progress
 from imfvla.protocol import MAX_WORKERS
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
+from imfvla.robot import RobotSpec
 from imfvla.rollout import run_episode
 from imfvla.views import ViewOptions
 
@@ -25,7 +28,6 @@ SEED_LIMIT = 10_000  # demonstrations may use the seeds below
 LOG_NAME = "collection.json"
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
 EPISODE_TIMEOUT_S = 900.0
-MAX_CAMERA_EVERY = 700  # control steps of an episode
 NOT_EMPTY = Limit("a text that is not empty", bool)
 # What folders were recorded with before a setting had a name.
 LATER_SETTINGS = {"dwell": 0}
@@ -40,13 +42,14 @@ class DemoOptions:
     first_seed: Annotated[int, within(0, SEED_LIMIT - 1)]
     directory: Annotated[str, NOT_EMPTY]
     frames_directory: Annotated[str, NOT_EMPTY] | None  # of the frame store, see imfvla.training.data
-    camera_every: Annotated[int, within(1, MAX_CAMERA_EVERY)]
+    camera_every: Annotated[int, at_least(1)]
     workers: Annotated[int, within(0, MAX_WORKERS)] | None
+    source: Annotated[str, one_of("scripted")] = "scripted"  # of imfvla.sources.opening
 
 
 @dataclass(frozen=True, slots=True)
 class SceneOptions:
-    """Which task is demonstrated; see `imfvla.tasks.load`."""
+    """Which task is demonstrated; see `imfvla.tasks.load`. Only this package's own tasks have scripted experts."""
 
     name: str
     variant: str
@@ -140,7 +143,20 @@ def read_settings(
     task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str
 ) -> tuple[DemoOptions, Settings]:
     """The checked options of a collection; `where` is the group of `demos` in messages. Raises UserError."""
+    if kind_of(task) != BIMANUAL:
+        raise UserError(
+            f"{KIND}={kind_of(task)} has no scripted expert, and so no demonstrations to collect: name recordings or a "
+            "data set with another demos=..."
+        )
     options = build(DemoOptions, demos, where)
+    most = tasks.TIME_LIMIT_STEPS
+    key = f"{where}.camera_every".lstrip(".")
+    require(
+        options.camera_every <= most,
+        key,
+        f"between 1 and {most}, the steps of an episode",
+        options.camera_every,
+    )
     expert = build(ExpertOptions, part_of({"task": task}, "task.expert"), "task.expert")
     seen = {
         key: part_of({"observation": observation}, f"observation.{key}") for key in ("views", "image_size")
@@ -211,10 +227,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     # A temporary name until it has succeeded: a kill must not leave a failed episode under the final one.
     trial = path.with_suffix(".mcap.trial")
     sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
-    sentences = {"paraphrases": env.paraphrases}
-    result = run_episode(
-        env, expert, seed, [sink], kind="demonstration", config=asdict(settings), metadata=sentences
-    )
+    result = run_episode(env, expert, seed, [sink], kind="demonstration", config=asdict(settings))
     with clear_write_errors(path):
         if result.success:
             trial.replace(path)
@@ -225,11 +238,13 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
 
 @lru_cache(maxsize=1)
 def _stage_for(settings: Settings) -> tuple[Any, Any]:
-    from imfvla import tasks  # here, since a GL backend is picked at import
-    from imfvla.tasks.experts import make_expert
+    from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
 
-    env = tasks.load(
-        settings.task, variant=settings.variant, image_size=settings.image_size, views=settings.views
+    env = environment_of(
+        {
+            "task": {"name": settings.task, "variant": settings.variant},
+            "observation": {"views": settings.views, "image_size": settings.image_size},
+        }
     )
     return env, make_expert(
         settings.task, modes=settings.modes, noise=settings.noise, hold=settings.hold, dwell=settings.dwell
@@ -319,11 +334,17 @@ def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:
         info = read_index(path).info
     except TruncatedRecording:
         return False
-    found = (info.kind, info.task, info.seed, info.views, info.image_size)
-    wanted = ("demonstration", settings.task, seed, settings.views, settings.image_size)
+    found = (info.kind, info.task, info.seed, info.views, sizes_of(info.robot))
+    size = settings.image_size
+    wanted = ("demonstration", settings.task, seed, settings.views, (size,) * len(settings.views))
     if found != wanted:
         raise UserError(
-            f"{path} must hold kind, task, seed, views and image size {wanted}, found {found}: its file was "
+            f"{path} must hold kind, task, seed, views and their sizes {wanted}, found {found}: its file was "
             "renamed; move it away."
         )
     return True
+
+
+def sizes_of(robot: RobotSpec) -> tuple[tuple[int, int], ...]:
+    """(H, W) [px] of the cameras, in their order."""
+    return tuple((camera.height, camera.width) for camera in robot.cameras)

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
+from imfvla.reporting.offline import read_offline
 from imfvla.reporting.runs import evaluations
+from imfvla.robot_of import has_environment
 from imfvla.run_directory import (
     DONE,
     EXECUTION_KEYS,
@@ -24,6 +26,7 @@ PROTOCOL_KEYS = (
     "noise_scale",
     "device",
 )
+OFFLINE_KEYS = ("noise_seed", "noise_scale", "device")
 
 
 def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
@@ -55,6 +58,13 @@ def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> b
     if differences(found, plain(config), EXECUTION_KEYS):
         return False
     wanted = config["evaluation"]
+    if not has_environment(config):
+        offline = read_offline(run)
+        kept = {key: wanted[key] for key in OFFLINE_KEYS} | {
+            "checkpoint_step": step,
+            "nfe": list(wanted["nfe"]),
+        }
+        return offline is not None and kept.items() <= offline["protocol"].items()
     protocol = {key: wanted[key] for key in PROTOCOL_KEYS} | {"checkpoint_step": step, "max_steps": None}
     of_protocol = [
         evaluation

@@ -73,10 +73,9 @@ def plain_name(name: str) -> str:
 
 
 def register_resolvers() -> None:
-    """Makes `run_name`, `plain_name` and `count` known to the configs, as `${count:list}`. May be called again."""
+    """Makes `run_name` and `plain_name` known to the configs, as `${plain_name:text}`. May be called again."""
     OmegaConf.register_new_resolver("plain_name", plain_name, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
-    OmegaConf.register_new_resolver("count", len, replace=True)
 
 
 def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | None = None) -> None:

@@ -24,17 +24,28 @@ MAX_REASON = 200  # characters of what torch says
 CHECKED = (bool, int, float, str, types.NoneType)
 
 
-def construct(part: Mapping[str, Any], key: str) -> Any:
+def construct(part: Mapping[str, Any], key: str, **handed: Any) -> Any:
     """The object that `part`, a resolved config under `key`, describes; nested parts are built first.
 
-    Raises UserError, before anything is built, where a `_target_` is neither a class of `PACKAGES` nor an optimiser of
-    torch, where a value violates the types of the constructor or their `Limit`, or where a text is an interpolation,
-    which would read the environment. What a constructor raises arrives wrapped by Hydra.
+    Those of the `handed` values that its constructor names are given to it, such as the sizes that a robot decides.
+
+    Raises UserError, before anything is built, where `part` states another value than the one that is handed, where a
+    `_target_` is neither a class of `PACKAGES` nor an optimiser of torch, where a value violates the types of the
+    constructor or their `Limit`, or where a text is an interpolation, which would read the environment. What a
+    constructor raises arrives wrapped by Hydra.
     """
     if not isinstance(part, Mapping) or "_target_" not in part:
         raise UserError(f"{key} must be a mapping with a _target_, found {part!r}.")
     _refuse_foreign(part, key, 0)
-    return instantiate(dict(part), _convert_="all")
+    for name in handed.keys() & part.keys():
+        require(
+            part[name] == handed[name],
+            f"{key}.{name}",
+            f"{handed[name]!r}, as robot and observation have it, or left out",
+            part[name],
+        )
+    taken = {name: value for name, value in handed.items() if name in _arguments_of(part["_target_"])}
+    return instantiate(dict(part) | taken, _convert_="all")
 
 
 def refuse_foreign_target(target: Any, key: str) -> None:
@@ -52,6 +63,13 @@ def refuse_foreign_target(target: Any, key: str) -> None:
 def reason_of(error: BaseException) -> str:
     """The message of an error, without the C++ stack that torch appends."""
     return (str(error).splitlines() or [type(error).__name__])[0][:MAX_REASON]
+
+
+def _arguments_of(target: str) -> set[str]:
+    """The names of what the constructor of a class takes, its base classes' included."""
+    module_name, _, name = target.rpartition(".")
+    classes = getattr(importlib.import_module(module_name), name).__mro__[:-1]
+    return {argument for cls in classes for argument in inspect.signature(cls.__init__).parameters}
 
 
 def _check_arguments(part: Mapping[str, Any], key: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from imfvla.actor import ChunkActor
+from imfvla.environment import Environment
 from imfvla.errors import UserError
 from imfvla.nn.residual import AttentionResidual, History
 from imfvla.rollout import run_episode
@@ -99,7 +100,7 @@ def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
 
 
 def measure_depth_attention(
-    env: Any, policy: Any, *, seed: int, nfe: int, max_steps: int | None = None
+    env: Environment, policy: Any, *, seed: int, nfe: int, max_steps: int | None = None
 ) -> dict[str, Any]:
     """Plays one episode and returns its weights: lists of rows under "actions" and "context", and how it was played."""
     actor = ChunkActor(policy, policy.horizon, nfe, noise_seed=0)

@@ -1,7 +1,7 @@
 """What a rollout needs of a world. dm_control tasks, Gymnasium environments and the tests' fakes implement it."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ class Outcome:
     reward: float
     stage: int  # the highest stage that holds now, 0 for none; always 0 where a task has no stages
     success: bool  # whether the episode counts as a success so far
-    ended: bool  # whether the world ends the episode here, at its time limit or before
+    ended: bool  # whether the world ends the episode here; before its time limit and without success, it is a failure
 
 
 class Environment(Protocol):
@@ -23,6 +23,8 @@ class Environment(Protocol):
 
     stages: their names in order, empty where success is a yes or no. instruction and paraphrases: of the episode that
     was reset last. goal: the task of that episode where one scene serves several, else None.
+
+    An environment with a simulator's bodies also has `scene() -> Bodies`; recordings then show them in 3D.
     """
 
     robot: RobotSpec
@@ -63,3 +65,16 @@ class Environment(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+class Bodies(Protocol):
+    """A simulator's bodies, for the 3D view of recordings: MuJoCo's model and data, or what has the same fields."""
+
+    model: Any
+    data: Any
+
+
+def bodies_of(env: Environment) -> Bodies | None:
+    """What an environment shows in 3D now; None where it has no simulator's bodies."""
+    scene = getattr(env, "scene", None)
+    return None if scene is None else scene()

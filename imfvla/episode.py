@@ -6,6 +6,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from imfvla.environment import Environment
+from imfvla.robot import RobotSpec
+
 CONTROL_HZ = 50
 STATE_DIM = 16
 ACTION_DIM = 16
@@ -18,13 +21,13 @@ ACTION_NAMES = tuple(
 class EpisodeInfo:
     """What is known when an episode begins."""
 
-    task: str  # "socket" | "transfer" | "combined"
+    task: str
     kind: str  # "demonstration" | "rollout"
     seed: int  # passed to reset; draws the start state
     start_digest: str  # hex digest of the start state
     instruction: str
-    views: tuple[str, ...]
-    image_size: tuple[int, int]  # (H, W) [px]
+    views: tuple[str, ...]  # cameras that the actor sees
+    robot: RobotSpec
     config: Mapping[str, Any]  # attached to the recording in full
     metadata: Mapping[str, Any] = field(default_factory=dict)  # expert style, policy name, nfe, ...
 
@@ -72,14 +75,14 @@ class EpisodeResult:
 class Actor(Protocol):
     """Chooses actions. A demonstrator may read the simulator behind `env`; a policy only looks through its cameras."""
 
-    def reset(self, env: Any, seed: int) -> None: ...
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision: ...
+    def reset(self, env: Environment, seed: int) -> None: ...
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision: ...
 
 
 class Sink(Protocol):
     """Receives an episode as it happens: `begin`, each `step`, then `end` or, after an exception, `abort`."""
 
-    def begin(self, env: Any, info: EpisodeInfo) -> None: ...
-    def step(self, env: Any, step: Step) -> None: ...
+    def begin(self, env: Environment, info: EpisodeInfo) -> None: ...
+    def step(self, env: Environment, step: Step) -> None: ...
     def end(self, result: EpisodeResult) -> None: ...
     def abort(self) -> None: ...

@@ -11,6 +11,7 @@ from imfvla.entry import entry_point
 from imfvla.errors import UserError
 from imfvla.options import build, is_whole, require
 from imfvla.protocol import EvaluationOptions
+from imfvla.robot_of import has_environment
 from imfvla.run_directory import RunDirectory
 
 
@@ -26,6 +27,13 @@ def main(config: dict[str, Any]) -> None:
     wanted = {key: value for key, value in config.items() if key != "run"} | {"nfe": read_nfe(config["nfe"])}
     options = build(EvaluationOptions, wanted, "")
     run = RunDirectory(config["run"])
+    if not has_environment(trained := run.config()):
+        from imfvla.offline import evaluate_offline
+        from imfvla.reporting.offline import print_offline
+
+        evaluate_offline(run, trained, options)
+        print_offline(run)
+        return
     summaries = evaluate(run, options)
     folders = [run.rollouts(summary["name"]) for summary in summaries]
     print_row(run, only=[folder.name for folder in folders])

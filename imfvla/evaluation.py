@@ -15,10 +15,11 @@ from imfvla.protocol import EvaluationOptions, Protocol
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.rollout_log import RolloutLog
 from imfvla.run_directory import RunDirectory, flatten
-from imfvla.workbench import Build, Job, gl_renderer, load_workbench, record, roll_out
+from imfvla.workbench import Build, Job, describe_world, load_workbench, record, roll_out
 from imfvla.workers import Here, Pool, worker_pool
 
-REQUIRED_KEYS = ("name", "task.name", "task.variant", "observation.views", "observation.image_size")
+REQUIRED_KEYS = ("name", "task.name", "observation.views", "observation.image_size")
+USUAL_VARIANT = "default"  # of a task that has no other
 
 
 def evaluate(
@@ -56,7 +57,7 @@ def evaluate(
         for number in options.nfe:
             protocol = Protocol(
                 task=config["task"]["name"],
-                variant=config["task"]["variant"],
+                variant=config["task"].get("variant", USUAL_VARIANT),
                 checkpoint_step=step,
                 weights=digest,
                 nfe=number,
@@ -83,18 +84,19 @@ def evaluate(
                     incidents_before = run_all.incidents
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
                     files = _record_some(job, rows, rollouts, run_all) if options.recordings else {}
-                    (renderer,) = run_all(gl_renderer, [(job,)])
+                    (world,) = run_all(describe_world, [(job,)])
                     summary = {
                         **summarise(rows),
                         "name": name,
                         "experiment": config["name"],
                         "nfe": number,
                         "checkpoint_step": step,
+                        **({} if world.stages is None else {"stages": list(world.stages)}),
                         "seeds": [protocol.seeds[0], protocol.seeds[-1]],
                         "protocol": asdict(protocol),
                         "recordings": files,
                         "worker_incidents": run_all.incidents - incidents_before,
-                        "fingerprint": fingerprint(threads=1, workers=count, gl_renderer=renderer),
+                        "fingerprint": fingerprint(threads=1, workers=count, gl_renderer=world.renderer),
                     }
                     rollouts.finish(rows, summary)
                 summaries.append(rollouts.summary)

@@ -1,4 +1,4 @@
-"""An experiment from nothing to its row of the table: collect, train, evaluate. A rerun resumes it."""
+"""An experiment from nothing to its row of the table: collect or open data, train, evaluate. A rerun resumes it."""
 
 import logging
 import os
@@ -10,18 +10,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.collection import check_demonstrations, ensure_demonstrations
+from imfvla.collection import check_demonstrations
 from imfvla.composition import EXECUTION_KEYS
+from imfvla.data.held_out import held_out
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.gl import select_gl_backend
 from imfvla.nn.pretrained import initialise_from_pretrained
+from imfvla.offline import evaluate_offline
+from imfvla.options import require
 from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
 from imfvla.rehearsal import read_options, rehearse
+from imfvla.reporting.offline import print_offline
 from imfvla.reporting.table_row import print_row
+from imfvla.robot_of import has_environment, robot_of, with_robot
 from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
-from imfvla.training.data import make_loader, prepare_windows
+from imfvla.sources.opening import SCRIPTED, kind_of, open_source
+from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import Alone, joined_processes
@@ -32,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
-    """Does the remaining work of the experiment in `run` and prints its row.
+    """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
 
     `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
     traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
@@ -40,13 +46,14 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
     options = read_options(config)
     training, optim, evaluation = options.training, options.optim, options.evaluation
     is_trained = training.steps in run.weight_steps()
+    config = with_robot(config)
     policy = rehearse(config, evaluation.nfe, evaluation.noise_scale)
     if not is_trained:
-        check_demonstrations(config)
+        _check_source(config)
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
-    if run.status().get("state") != DONE:
+    if has_environment(config) and run.status().get("state") != DONE:
         select_gl_backend()  # without one, training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
         if not is_trained:
@@ -55,6 +62,19 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
             _run_stages(config, run, training, optim, evaluation, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, run, training, optim, processes)
+
+
+def _check_source(config: Mapping[str, Any]) -> None:
+    """Raises UserError where the episodes to learn from cannot be had, or are of another robot; records none."""
+    if kind_of(config) == SCRIPTED:
+        require(
+            has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED
+        )
+        check_demonstrations(config)
+        return
+    source = open_source(config)
+    refuse_other_source(config, source)
+    held_out(config["task"], len(source))
 
 
 def _run_stages(
@@ -76,7 +96,10 @@ def _run_stages(
             else:
                 _train(config, run, training, optim, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
-            evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+            if has_environment(config):
+                evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+            else:
+                evaluate_offline(run, config, evaluation)
             if run.status().get("state") != DONE:
                 run.write_status(DONE)
         except KeyboardInterrupt:
@@ -86,7 +109,10 @@ def _run_stages(
             with suppress(UserError):  # a full disk must not hide the error
                 run.write_status(FAILED, error=str(error), traceback=traceback.format_exc())
             raise
-    print_row(run)
+    if has_environment(config):
+        print_row(run)
+    else:
+        print_offline(run)
 
 
 def _train(
@@ -98,12 +124,12 @@ def _train(
 ) -> None:
     if processes.is_first:
         run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
-        windows = prepare_windows(config, ensure_demonstrations(config))
+        windows = prepare_windows(config, open_source(config))
         run.write_status(RUNNING, phase="training", pid=os.getpid())
         processes.wait()
     else:
         processes.wait()  # for demonstrations and frame store, which exist by then
-        windows = prepare_windows(config, ensure_demonstrations(config))
+        windows = prepare_windows(config, open_source(config))
     seed = config["seed"]
     initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
@@ -123,6 +149,7 @@ def _train(
             "name": config["name"],
             "seed": seed,
             "num_parameters": num_parameters,
+            "robot": robot_of(config).to_json(),
             "config_digest": config_digest(config, EXECUTION_KEYS),
         },
         processes=processes,

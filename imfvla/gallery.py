@@ -8,14 +8,17 @@ if __name__ == "__main__":
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from imfvla.entry import entry_point
-from imfvla.episode import CONTROL_HZ
+from imfvla.episode import Actor
 from imfvla.files import write_together
 from imfvla.options import build, within
+
+if TYPE_CHECKING:
+    from imfvla.tasks.bimanual import BimanualEnvironment
 
 MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
 
@@ -52,7 +55,7 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
     for label, expert in experts.items():
         frames = _play(env, expert, seed, size)
         chosen = [frames[round(share * (len(frames) - 1))] for share in MOMENTS]
-        rows = [(f"{step / CONTROL_HZ:.1f} s", pictures) for step, pictures in chosen]
+        rows = [(f"{step / env.robot.control_hz:.1f} s", pictures) for step, pictures in chosen]
         path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
         write_together({path: png(contact_sheet(rows, env.all_views))})
         paths.append(path)
@@ -60,7 +63,9 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
     return paths
 
 
-def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[str, Any]]:
+def _both_ways(
+    env: "BimanualEnvironment", task: Mapping[str, Any], seed: int
+) -> tuple[int, dict[str, Actor]]:
     """A seed whose hidden draw differs from the unimodal expert's choice, and both experts."""
     from imfvla.tasks.experts import make_expert
 
@@ -74,7 +79,9 @@ def _both_ways(env: Any, task: Mapping[str, Any], seed: int) -> tuple[int, dict[
         seed += 1
 
 
-def _play(env: Any, expert: Any, seed: int, size: int, every: int = 10) -> list[tuple[int, list[np.ndarray]]]:
+def _play(
+    env: "BimanualEnvironment", expert: Actor, seed: int, size: int, every: int = 10
+) -> list[tuple[int, list[np.ndarray]]]:
     """Steps done and pictures of all views every few steps of an episode, including its first and last state."""
     env.reset(seed)
     expert.reset(env, seed)

@@ -1,14 +1,17 @@
 """Chooses how MuJoCo renders without a screen; must run before mujoco is imported."""
 
+import importlib.abc
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from imfvla.errors import UserError
 
+SIMULATORS = ("mujoco", "dm_control")  # they read MUJOCO_GL when they are imported
 BACKENDS = ("egl", "osmesa", "glfw", "cgl", "wgl")
 PROBED = ("egl", "osmesa")  # in the order of preference
 PROBE_TIMEOUT_S = 30.0  # a driver answers within a second, or never
@@ -62,6 +65,24 @@ def select_gl_backend() -> str:
         os.environ["PYOPENGL_PLATFORM"] = backend
     os.environ.setdefault("LP_NUM_THREADS", "0")
     return backend
+
+
+class _BeforeSimulators(importlib.abc.MetaPathFinder):
+    """Finds no module; it only notices that a simulator is about to be imported."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: object = None) -> None:
+        if fullname in SIMULATORS:
+            select_gl_backend()
+            sys.meta_path.remove(self)
+
+
+def select_before_simulators() -> None:
+    """Has `select_gl_backend` called when mujoco or dm_control is first imported, and not before.
+
+    So that what only asks about tasks, such as a table or a training without rendering, needs no OpenGL.
+    """
+    if not any(isinstance(finder, _BeforeSimulators) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _BeforeSimulators())
 
 
 def _first_that_draws(candidates: tuple[str, ...]) -> str:

@@ -3,7 +3,7 @@
 Shapes: B batch, Tp predicted steps, A action.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,8 @@ from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.horizon import Horizon
 from imfvla.protocol import USUAL_NOISE
+from imfvla.robot import RobotSpec
+from imfvla.robot_of import robot_of, view_options
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -26,7 +28,9 @@ class Policy(nn.Module):
         self,
         *,
         horizon: Horizon,
-        action_dim: int,
+        robot: RobotSpec,
+        views: Sequence[str],
+        image_size: tuple[int, int],
         chunks: ChunkFrame,
         encoder: nn.Module,
         core: nn.Module,
@@ -34,7 +38,9 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         self.horizon = horizon
-        self.action_dim = action_dim
+        self.robot = robot
+        self.views = tuple(views)  # cameras that it sees, in this order
+        self.image_size = tuple(image_size)  # (H, W) [px] at which it sees them
         self.encoder = encoder
         self.core = core
         self.generator = generator
@@ -43,7 +49,7 @@ class Policy(nn.Module):
     @property
     def noise_shape(self) -> tuple[int, int]:
         """(Tp, A) of the noise that one prediction starts from."""
-        return self.horizon.pred, self.action_dim
+        return self.horizon.pred, len(self.robot.action)
 
     def first_steps(self, steps: int) -> dict[str, int]:
         """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
@@ -104,17 +110,25 @@ def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
 def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
     """The policy that a composed configuration describes, with the normalisers fitted where `statistics` are given.
 
+    Encoder and core are handed what robot and observation decide: the numbers of views, states and actions, and where
+    the state is among the context tokens.
     Without statistics the normalisers are not-a-number until a checkpoint fills them. Raises UserError where the
     parts do not fit together.
     """
     try:
-        horizon = Horizon(**config["horizon"])
+        horizon, robot, seen = Horizon(**config["horizon"]), robot_of(config), view_options(config)
+        chunks = ChunkFrame(config["action_frame"], horizon.pred, robot)
+        encoder = construct(config["encoder"], "encoder", views=len(seen.views), state_dim=len(robot.state))
         policy = Policy(
             horizon=horizon,
-            action_dim=config["action_dim"],
-            chunks=ChunkFrame(config["action_frame"], horizon.pred, config["action_dim"]),
-            encoder=construct(config["encoder"], "encoder"),
-            core=construct(config["core"], "core"),
+            robot=robot,
+            views=seen.views,
+            image_size=seen.image_size,
+            chunks=chunks,
+            encoder=encoder,
+            core=construct(
+                config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
+            ),
             generator=construct(config["generator"], "generator"),
         )
     except KeyError as error:

@@ -20,9 +20,11 @@ from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import Mapping as RowMapping
 from imfvla.reporting.media import Media
+from imfvla.reporting.offline import offline_table, read_offline
 from imfvla.reporting.page import Picture, page
 from imfvla.reporting.paper import TABLES
 from imfvla.reporting.results import Result
+from imfvla.reporting.runs import find_runs, key_of
 from imfvla.reporting.table import Table
 from imfvla.reporting.tables import Document, comparison_table, other_table, paper_table
 
@@ -71,7 +73,8 @@ def publish(
         check_equal_protocols([answer for answer in answers if answer.row.table == number])
     results = [Result.of(answer) for answer in answers]
     others = [Result(found) for found in sources.others(answers)]
-    if all(result.is_missing for result in results) and not others:
+    offline = _offline(directories)
+    if all(result.is_missing for result in results) and not others and not offline:
         raise UserError(
             f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "
             "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
@@ -80,6 +83,8 @@ def publish(
     documents = {f"table{number}": paper_table(number, of_table[number]) for number in TABLES}
     documents["table3"] = comparison_table(compare(mapping.comparisons, results))
     documents["others"] = other_table(others)
+    if offline:
+        documents["offline"] = offline_table(offline)
     figures = _figures(of_table[1], of_table[2], others, method)
     pictures = [Picture(name, caption, files[".svg"]) for name, (caption, files) in figures.items()]
     tables = tuple(document.shown for document in documents.values())
@@ -90,6 +95,16 @@ def publish(
     for name, (_, rendered) in figures.items():
         files |= {output / "figures" / f"{name}{suffix}": content for suffix, content in rendered.items()}
     return Publication(tables, files, linked.copies)
+
+
+def _offline(directories: Sequence[Path]) -> list[tuple[str, dict[str, Any]]]:
+    """Name and numbers of every run that was evaluated without an environment."""
+    found = []
+    for run in find_runs(directories):
+        if (numbers := read_offline(run)) is not None:
+            key = key_of(run.path, numbers["experiment"])
+            found.append((f"{numbers['experiment']}/{key}" if key else numbers["experiment"], numbers))
+    return found
 
 
 def _formats(document: Document) -> dict[str, str]:

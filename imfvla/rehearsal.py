@@ -9,7 +9,6 @@ import torch
 from imfvla.chunks import FRAMES
 from imfvla.construction import reason_of
 from imfvla.data import Augmentation
-from imfvla.episode import ACTION_DIM, STATE_DIM
 from imfvla.errors import UserError
 from imfvla.evaluation import require_device
 from imfvla.horizon import Horizon
@@ -17,11 +16,11 @@ from imfvla.instruction import MAX_WORDS
 from imfvla.options import build, one_of, part_of, require, within
 from imfvla.policy import Policy, build_policy
 from imfvla.protocol import MAX_SEED, USUAL_NOISE, EvaluationOptions
+from imfvla.robot_of import has_environment, view_options
 from imfvla.run_directory import step_of
 from imfvla.training.loop import choose_device
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.types import Batch, Observation
-from imfvla.views import ViewOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +29,6 @@ class Scalars:
 
     name: str
     seed: Annotated[int, within(0, MAX_SEED)]
-    state_dim: Annotated[int, one_of(STATE_DIM)]
-    action_dim: Annotated[int, one_of(ACTION_DIM)]
     action_frame: Annotated[str, one_of(*FRAMES)]
 
 
@@ -49,12 +46,11 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
     build(Scalars, {name: part_of(config, name) for name in Scalars.__slots__}, "")
     build(Horizon, part_of(config, "horizon"), "horizon")
     build(Augmentation, part_of(config, "augmentation"), "augmentation")
-    seen = {name: part_of(config, f"observation.{name}") for name in ViewOptions.__slots__}
-    views = build(ViewOptions, seen, "observation").views
+    view_options(config)
+    if not has_environment(config):
+        part_of(config, "task.held_out")
     paraphrases = part_of(config, "task.paraphrases")
     require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
-    count = part_of(config, "observation.num_views")
-    require(count == len(views), "observation.num_views", f"the number of views, {len(views)}", count)
     training = build(TrainingOptions, part_of(config, "training"), "training")
     optim = build(OptimOptions, part_of(config, "optim"), "optim")
     evaluation = build(EvaluationOptions, part_of(config, "evaluation"), "evaluation")
@@ -80,7 +76,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
         policy = build_unfitted(config).eval()
         for number in nfe:
             policy.check_sampling(number, noise_scale)
-        observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
+        observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():
             loss, _ = policy.loss(Batch(observation, noise, valid), torch.Generator().manual_seed(0))
@@ -100,18 +96,18 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
 def build_unfitted(config: Mapping[str, Any]) -> Policy:
     """The policy of a composed config with normalisers that change nothing: it runs, but its outputs mean nothing."""
     policy = build_policy(config)
-    states = torch.ones(config["state_dim"])
+    states = torch.ones(len(policy.robot.state))
     policy.encoder.fit(-states, states)
     chunk = torch.zeros(policy.noise_shape)
     policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
     return policy
 
 
-def blank_observation(config: Mapping[str, Any]) -> Observation:
+def blank_observation(policy: Policy) -> Observation:
     """Black pictures, zeros as the state and an empty sentence, of batch 1."""
-    steps, seen = config["horizon"]["obs"], config["observation"]
+    steps = policy.horizon.obs
     return Observation(
-        images=torch.zeros(1, steps, seen["num_views"], 3, *seen["image_size"], dtype=torch.uint8),
-        state=torch.zeros(1, steps, config["state_dim"]),
+        images=torch.zeros(1, steps, len(policy.views), 3, *policy.image_size, dtype=torch.uint8),
+        state=torch.zeros(1, steps, len(policy.robot.state)),
         instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
     )

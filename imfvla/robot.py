@@ -63,6 +63,14 @@ class RobotSpec:
             require(
                 not repeated, f"robot.{key}", "names that all differ", f"{', '.join(repeated)} more than once"
             )
+            groups = {name[:place] for name in plain for place, sign in enumerate(name) if sign == "/"}
+            shared = sorted(groups & set(plain))
+            require(
+                not shared,
+                f"robot.{key}",
+                "channels that are no group of others",
+                f"{', '.join(shared)} as both",
+            )
         for key in ("relative_to", "action_min", "action_max"):
             count = len(getattr(self, key))
             require(

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.episode import CONTROL_HZ, Actor, EpisodeInfo, EpisodeResult, Sink, Step
+from imfvla.environment import Environment, Outcome
+from imfvla.episode import Actor, EpisodeInfo, EpisodeResult, Sink, Step
+from imfvla.errors import UserError
 
 NON_FINITE = "non-finite action"
 FAR_OUT_OF_RANGE = "action far out of range"
@@ -19,7 +21,7 @@ class ActionError(Exception):
 
 
 def run_episode(
-    env: Any,
+    env: Environment,
     actor: Actor,
     seed: int,
     sinks: Sequence[Sink],
@@ -33,14 +35,15 @@ def run_episode(
 
     The episode lasts until the environment ends it, until `max_steps` control steps, or until
     `actor.done(env)` where the actor has a `done` (demonstrators stop some steps after success; policies
-    run to the end).
+    run to the end). It is a success where the last step's outcome says so. An environment that ends an episode before
+    its time limit, and without success, has failed it.
 
     An actor that raises `ActionError` or executes a non-finite action ends the episode as failed: the row
     keeps the reward collected so far, carries the label and counts as no success. Any other exception
-    aborts the sinks and is re-raised.
+    aborts the sinks and is re-raised. UserError where the environment does not do what its robot says.
 
     Args:
-      env: a `BimanualEnvironment` (see `imfvla.tasks`).
+      env: any world; its `robot` says how much time a control step takes.
       actor: an `episode.Actor`; its `style`, where it has one, goes into the recording's metadata.
       seed: draws the start state, and whatever the actor draws.
       sinks: recorders; they begin in order after the reset and end in order after the last step.
@@ -50,9 +53,11 @@ def run_episode(
       max_steps: an upper bound on the control steps, for short tests.
 
     Returns:
-      The episode's row; `first_step_of_stage[k - 1]` is the first step after which stage k or higher held.
+      The episode's row; `first_step_of_stage[k - 1]` is the first step after which stage k or higher held, and it is
+      empty where the task has no stages.
     """
-    timestep = env.reset(seed=seed)
+    env.reset(seed)
+    _refuse_misfit(env)
     start_digest = env.start_digest()
     actor.reset(env, seed)
     done = getattr(actor, "done", None)
@@ -64,13 +69,18 @@ def run_episode(
         start_digest=start_digest,
         instruction=env.instruction,
         views=tuple(env.views),
-        image_size=tuple(env.image_size),
+        robot=env.robot,
         config=config,
-        metadata={**(metadata or {}), **({"style": dict(actor.style)} if hasattr(actor, "style") else {})},
+        metadata={
+            **(metadata or {}),
+            **({"paraphrases": env.paraphrases} if env.paraphrases else {}),
+            **({"style": dict(actor.style)} if hasattr(actor, "style") else {}),
+        },
     )
     rewards: list[float] = []
     inference_ms: list[float] = []
-    first_step_of_stage = [-1] * env.num_stages
+    first_step_of_stage = [-1] * len(env.stages)
+    outcome = Outcome(reward=0.0, stage=0, success=False, ended=False)
     failure = None
     with ExitStack() as aborts:
         for sink in sinks:
@@ -86,37 +96,48 @@ def run_episode(
             except ActionError as error:
                 failure = str(error)
                 break
-            timestep = env.step(decision.executed)
-            stage = env.stage()
-            rewards.append(float(timestep.reward))
+            outcome = env.step(decision.executed)
+            rewards.append(float(outcome.reward))
             if decision.inference_ms is not None:
                 inference_ms.append(float(decision.inference_ms))
-            for reached in range(stage):
+            for reached in range(outcome.stage):
                 if first_step_of_stage[reached] < 0:
                     first_step_of_stage[reached] = index
-            step = Step(index, index / CONTROL_HZ, state, decision, rewards[-1], stage)
+            step = Step(index, index / env.robot.control_hz, state, decision, rewards[-1], outcome.stage)
             for sink in sinks:
                 sink.step(env, step)
-            if timestep.last():
-                failure = SIMULATION_ENDED if index + 1 < env.time_limit_steps else None
+            if outcome.ended:
+                if index + 1 < env.time_limit_steps and not outcome.success:
+                    failure = SIMULATION_ENDED
                 break
             if done is not None and done(env):
                 break
-        max_reward = max(rewards, default=0.0)
         result = EpisodeResult(
             seed=seed,
             start_digest=start_digest,
             num_steps=len(rewards),
             total_reward=float(sum(rewards)),
-            max_reward=max_reward,
-            success=failure is None and max_reward >= env.success_stage,
+            max_reward=max(rewards, default=0.0),
+            success=failure is None and outcome.success,
             first_step_of_stage=tuple(first_step_of_stage),
             failure=failure,
             inference_ms=tuple(inference_ms),
             wall_s=time.perf_counter() - began,
-            goal=getattr(env, "goal", None),
+            goal=env.goal,
         )
         for sink in sinks:
             sink.end(result)
         aborts.pop_all()
     return result
+
+
+def _refuse_misfit(env: Environment) -> None:
+    """Raises UserError where what an environment shows is not what its robot says."""
+    for view in env.views:
+        env.robot.camera(view)
+    state, wanted = np.asarray(env.state()), len(env.robot.state)
+    if state.shape != (wanted,):
+        raise UserError(
+            f"The environment {env.name} does not fit its robot: state() must be {wanted} numbers, as the robot has "
+            f"state channels, found an array of shape {state.shape}; correct one of them."
+        )

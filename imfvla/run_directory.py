@@ -40,6 +40,19 @@ EXECUTION_KEYS = (
     "training.log_every",
     "training.save_every_s",
 )
+# Keys that follow from others: the robot, and the numbers of views, states and actions, which older runs have too.
+DERIVED_KEYS = (
+    "robot",
+    "state_dim",
+    "action_dim",
+    "observation.num_views",
+    "encoder.views",
+    "encoder.state_dim",
+    "core.channels",
+    "core.state_token",
+)
+# What a key is in a run that is older than the key.
+LATER_KEYS = {"demos.source": "scripted"}
 
 
 class RunDirectory:
@@ -198,8 +211,8 @@ def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> s
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> list[str]:
-    """One "key was a, is b" per key of nested mappings whose values differ."""
-    before, after = flatten(old), flatten(new)
+    """One "key was a, is b" per key of nested mappings whose values differ, those apart that follow from others."""
+    before, after = LATER_KEYS | flatten(old), LATER_KEYS | flatten(new)
     keys = [key for key in {**before, **after} if not _is_ignored(key, ignored)]
     absent = object()
     return [
@@ -226,7 +239,7 @@ def plain(value: Any) -> Any:
 
 
 def _is_ignored(key: str, ignored: tuple[str, ...]) -> bool:
-    return any(key == name or key.startswith(f"{name}.") for name in ignored)
+    return any(key == name or key.startswith(f"{name}.") for name in (*ignored, *DERIVED_KEYS))
 
 
 def _shown(flat: Mapping[str, Any], key: str) -> str:

@@ -11,7 +11,8 @@ class Statistics:
     """What a policy's normalisers need, float32.
 
     Of states (S,) and clean actions (A,): over all recorded control steps. Of displacements (Tp, A), the actions of a
-    chunk less the state at its decision: over all windows, steps past an episode's end left out.
+    chunk less the state channels that they are relative to, as these are at its decision: over all windows, steps past
+    an episode's end left out. Those of absolute channels mean nothing.
     """
 
     state_min: np.ndarray

@@ -14,7 +14,7 @@ class Observation:
     """What a policy sees at one decision."""
 
     images: Tensor  # uint8   (B, To, V, 3, H, W)
-    state: Tensor  # float32 (B, To, S)  per arm 7 joint angles [rad] and the gripper opening [0, 1]
+    state: Tensor  # float32 (B, To, S)  in the units that the robot's channels state
     instruction: Tensor  # int64   (B, L)  word ids, 0 is padding
 
     def to(self, device: torch.device | str) -> "Observation":

@@ -9,14 +9,15 @@ from typing import Any
 import torch
 
 from imfvla.actor import ChunkActor
+from imfvla.environment import Environment
+from imfvla.environments import environment_of
 from imfvla.reporting.metrics import Row, row_of, untimed
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
 
-VIDEO_SIZE = (240, 240)  # (H, W) of a view [px]
-VIDEO_EVERY = 2  # control steps between two frames of a video: 25 frames a second
+VIDEO_HEIGHT = 240  # of a view [px]
 
-Build = Callable[[Path, int], tuple[Any, Any]]  # run directory, training step -> environment, policy
+Build = Callable[[Path, int], tuple[Environment, Any]]  # run directory, training step -> environment, policy
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,33 +34,26 @@ class Job:
     device: str  # of the policy
 
 
-def load_workbench(run: Path, step: int) -> tuple[Any, Any]:
+def load_workbench(run: Path, step: int) -> tuple[Environment, Any]:
     """The environment that a run was configured for, and its policy as it was after `step` training steps."""
-    from imfvla import tasks  # here, since a GL backend is picked at import
     from imfvla.training.checkpoint import load_policy
 
     directory = RunDirectory(run)
-    config = directory.config()
-    env = tasks.load(
-        config["task"]["name"],
-        variant=config["task"]["variant"],
-        views=tuple(config["observation"]["views"]),
-        image_size=tuple(config["observation"]["image_size"]),
-    )
-    return env, load_policy(directory, step)
+    return environment_of(directory.config()), load_policy(directory, step)
 
 
-def gl_renderer(job: Job) -> str:
-    """The name of the renderer, such as "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+@dataclass(frozen=True, slots=True)
+class World:
+    """What a summary says of the world that was played in."""
 
-    def ask() -> str:
-        from OpenGL import GL  # here, since the platform is chosen when the environment is built
+    renderer: str
+    stages: tuple[str, ...] | None  # their names; None where episodes have stages of different tasks
 
-        return GL.glGetString(GL.GL_RENDERER).decode()
 
+def describe_world(job: Job) -> World:
+    """Of the environment in which episodes are played."""
     env, _ = _bench(job.build, job.run, job.step)
-    with env.physics.contexts.gl.make_current() as context:
-        return context.call(ask)
+    return World(env.renderer(), None if env.goal else env.stages)
 
 
 def roll_out(job: Job, seed: int) -> dict[str, Any]:
@@ -78,7 +72,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
     env, _ = _bench(job.build, job.run, job.step)
     sinks = [
         McapSink(path, lossless=False),
-        VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), size=VIDEO_SIZE, every=VIDEO_EVERY),
+        VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), height=VIDEO_HEIGHT),
     ]
     row = _play(job, expected["seed"], sinks)
     before, after = untimed(expected), untimed(row)
@@ -111,5 +105,5 @@ def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def _bench(build: Build, run: Path, step: int) -> tuple[Any, Any]:
+def _bench(build: Build, run: Path, step: int) -> tuple[Environment, Any]:
     return build(run, step)

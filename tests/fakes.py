@@ -1,77 +1,121 @@
-"""An environment and a policy whose every answer is known: rollouts without simulator and training."""
+"""Environments and a policy whose every answer is known: rollouts without simulator and training."""
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import torch
 from synthetic import StillScene
 from torch import Tensor
 
-from imfvla.episode import ACTION_DIM, STATE_DIM
+from imfvla.environment import Outcome
 from imfvla.horizon import Horizon
+from imfvla.robot import Camera, RobotSpec
 from imfvla.types import Observation
 
 LIMIT = 4.0  # of every action
 
 
-def known_actions(num_steps: int) -> np.ndarray:
+def fake_robot(
+    num_states: int = 16,
+    num_actions: int = 16,
+    cameras: tuple[Camera, ...] = (Camera("front", 16, 16), Camera("top", 16, 16)),
+    control_hz: float = 50.0,
+) -> RobotSpec:
+    """A robot of so many channels, the last of each a gripper, the first ones grouped by a slash."""
+
+    def names(count: int) -> tuple[str, ...]:
+        return (*(f"arm/joint_{number} [rad]" for number in range(1, count)), "gripper [0, 1]")
+
+    relative = [index if index < num_states - 1 else None for index in range(num_actions - 1)]
+    return RobotSpec(
+        state=names(num_states),
+        action=names(num_actions),
+        relative_to=(*relative, None),
+        action_min=(-LIMIT,) * num_actions,
+        action_max=(LIMIT,) * num_actions,
+        control_hz=control_hz,
+        cameras=cameras,
+    )
+
+
+ROBOT = fake_robot()
+
+
+def known_actions(num_steps: int, robot: RobotSpec = ROBOT) -> np.ndarray:
     """float32 (num_steps, A): row s is what the known policies do at step s; no two rows are equal."""
-    return np.random.default_rng(7).uniform(-1, 1, (num_steps, ACTION_DIM)).astype(np.float32)
+    size = (num_steps, len(robot.action))
+    return np.random.default_rng(7).uniform(-1, 1, size).astype(np.float32)
 
 
-class FakeEnvironment(StillScene):
-    """Moves where the action says; the first two pixels of each frame and the state tell which step it is."""
+class PlainEnvironment(StillScene):
+    """An `Environment` without a simulator's bodies; see `FakeEnvironment`. Without stages, success comes at step 9."""
 
-    name, variant, instruction = "fake", "default", "put the peg into the socket"
-    num_stages, success_stage = 3, 3
+    variant, instruction, paraphrases, goal = "default", "put the peg into the socket", (), None
+    scene = None
 
-    def __init__(self, time_limit_steps: int = 40, ends_at: int | None = None) -> None:
-        super().__init__(views=("front", "top"), image_size=(16, 16))
-        context = SimpleNamespace(call=lambda function: "no renderer")
-        self.physics.contexts = SimpleNamespace(gl=SimpleNamespace(make_current=lambda: nullcontext(context)))
+    def __init__(
+        self,
+        time_limit_steps: int = 40,
+        ends_at: int | None = None,
+        *,
+        name: str = "fake",
+        robot: RobotSpec = ROBOT,
+        stages: tuple[str, ...] = ("reach", "hold", "place"),
+    ) -> None:
+        super().__init__(robot)
+        self.name, self.stages = name, stages
         self.time_limit_steps = time_limit_steps
         self._ends_at = ends_at or time_limit_steps
         self.executed: list[np.ndarray] = []
         self.looked: list[int] = []
 
-    def action_spec(self) -> SimpleNamespace:
-        shape = (ACTION_DIM,)
-        return SimpleNamespace(shape=shape, minimum=np.full(shape, -LIMIT), maximum=np.full(shape, LIMIT))
-
-    def reset(self, seed: int) -> SimpleNamespace:
+    def reset(self, seed: int) -> None:
         self._seed, self._step, self.position = seed, 0, 0.0
         self.executed, self.looked = [], []
-        return SimpleNamespace(reward=None, last=lambda: False)
 
-    def step(self, action: np.ndarray) -> SimpleNamespace:
+    def step(self, action: np.ndarray) -> Outcome:
         self.executed.append(np.array(action))
         self._step += 1
         self.position = float(np.clip(action[0], -1, 1))
-        last = self._step >= self._ends_at
-        return SimpleNamespace(reward=float(self.stage()), last=lambda: last)
+        ended = self._step >= self._ends_at
+        if not self.stages:
+            success = self._seed % 2 == 1 and self._step >= 9
+            return Outcome(float(success), 0, success, ended)
+        stage = self.stage()
+        return Outcome(float(stage), stage, stage == len(self.stages), ended)
 
     def stage(self) -> int:
         """Rises with the steps, up to a stage that the seed determines."""
-        return min(self._step // 8, self._seed % (self.num_stages + 1))
+        return min(self._step // 8, self._seed % (len(self.stages) + 1))
 
     def state(self) -> np.ndarray:
-        return np.full(STATE_DIM, self._step, np.float32)
+        return np.full(len(self.robot.state), self._step, np.float32)
 
     def start_digest(self) -> str:
         return f"{self._seed:016x}"
 
-    def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
+    def look(self) -> dict[str, np.ndarray]:
         self.looked.append(self._step)
-        frames = super().look(views)
+        frames = super().look()
         for frame in frames.values():
             frame[0, 0, 0], frame[0, 1, 0] = divmod(self._step, 256)
         return frames
 
     def render(self, view: str, height: int, width: int) -> np.ndarray:
         return np.full((height, width, 3), self._step % 256, np.uint8)
+
+    def renderer(self) -> str:
+        return "no renderer"
+
+    def close(self) -> None:
+        pass
+
+
+class FakeEnvironment(PlainEnvironment):
+    """Moves where the action says; the first two pixels of each frame and the state tell which step it is."""
+
+    scene = StillScene.scene
 
 
 @dataclass
@@ -81,15 +125,18 @@ class KnownPolicy:
     horizon: Horizon
     actions: np.ndarray
     noise_scale: float = 0.0
+    robot: RobotSpec = ROBOT
 
     def __post_init__(self) -> None:
+        self.views = tuple(camera.name for camera in self.robot.cameras)
+        self.image_size = (self.robot.cameras[0].height, self.robot.cameras[0].width)
         self.seen: list[np.ndarray] = []
         self.noises: list[np.ndarray] = []
         self.evaluations: list[int] = []
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        return self.horizon.pred, ACTION_DIM
+        return self.horizon.pred, self.actions.shape[1]
 
     def eval(self) -> "KnownPolicy":
         return self

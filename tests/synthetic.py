@@ -5,19 +5,23 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from imfvla.episode import ACTION_DIM, CONTROL_HZ, Decision, EpisodeInfo, EpisodeResult, Step
+from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.recording import McapSink
+from imfvla.robot import RobotSpec
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
 VIEWS = ("front", "top", "r_wrist")
 INSTRUCTION = "put the peg into the socket"
+ROBOT = bimanual_robot(VIEWS, (32, 32))
 PARAPHRASES = ("insert the peg", "push the peg into the hole")
 
 
 class StillScene:
     """Takes the place of an environment: a red box, and frames where a square moves with `position`."""
 
-    def __init__(self, views: tuple[str, ...], image_size: tuple[int, int]) -> None:
-        self.views, self.image_size, self.position = views, image_size, 0.0
+    def __init__(self, robot: RobotSpec) -> None:
+        self.robot, self.position = robot, 0.0
+        self.views = tuple(camera.name for camera in robot.cameras)
         model = SimpleNamespace(
             names=b"synthetic\0world\0box\0",
             name_bodyadr=np.array([10, 16]),
@@ -32,25 +36,32 @@ class StillScene:
             geom_quat=np.array([[1.0, 0.0, 0.0, 0.0]]),
         )
         data = SimpleNamespace(xpos=np.zeros((2, 3)), xquat=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
-        self.physics = SimpleNamespace(model=model, data=data)
+        self._bodies = SimpleNamespace(model=model, data=data)
 
-    def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-        height, width = self.image_size
-        column = int((self.position + 1) / 2 * (width - width // 4))
+    def scene(self) -> SimpleNamespace:
+        return self._bodies
+
+    def look(self) -> dict[str, np.ndarray]:
         frames = {}
-        for number, view in enumerate(views or self.views):
+        for number, view in enumerate(self.views):
+            camera = self.robot.camera(view)
+            height, width = camera.height, camera.width
+            column = int((self.position + 1) / 2 * (width - width // 4))
             frame = np.full((height, width, 3), 40 * number, np.uint8)
             frame[height // 3 : 2 * height // 3, column : column + width // 4] = (200, 220, 240 - number)
             frames[view] = frame
         return frames
 
 
-def synthetic_actions(seed: int, num_steps: int) -> np.ndarray:
-    """float32 (num_steps, A): the actions of the episode of this seed, no two rows of any episode equal."""
-    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, ACTION_DIM)
+def synthetic_actions(seed: int, num_steps: int, robot: RobotSpec = ROBOT) -> np.ndarray:
+    """float32 (num_steps, A): the actions of the episode of this seed, no two rows of any episode equal.
+
+    Those that are no displacements lie in [0, 1], as grippers do.
+    """
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, len(robot.action))
     steps = np.arange(num_steps)[:, None]
     actions = np.sin(phase + 0.1 * steps)
-    actions[:, 7::8] = actions[:, 7::8] / 2 + 0.5
+    actions[:, ~robot.relative] = actions[:, ~robot.relative] / 2 + 0.5
     return actions.astype(np.float32)
 
 
@@ -65,8 +76,9 @@ def write_episode(
     task: str = "socket",
 ) -> None:
     """Records one episode whose state at step s is the action of step s - 1, seen in the frames of step s."""
-    env = StillScene(views, image_size)
-    actions = synthetic_actions(seed, num_steps)
+    robot = bimanual_robot(views, image_size)
+    env = StillScene(robot)
+    actions = synthetic_actions(seed, num_steps, robot)
     states = np.concatenate([actions[:1], actions[:-1]])
     info = EpisodeInfo(
         task=task,
@@ -75,7 +87,7 @@ def write_episode(
         start_digest=f"{seed:016x}",
         instruction=INSTRUCTION,
         views=views,
-        image_size=image_size,
+        robot=robot,
         config={"name": "synthetic"},
         metadata={"paraphrases": PARAPHRASES},
     )
@@ -86,7 +98,7 @@ def write_episode(
         env.position = actions[index, 0]  # what the action brings about, and the frames of the next step show
         noise = np.float32(0.01 * (-1) ** index)
         decision = Decision(actions[index], actions[index] + noise)
-        sink.step(env, Step(index, index / CONTROL_HZ, states[index], decision, 0.0, 0))
+        sink.step(env, Step(index, index / robot.control_hz, states[index], decision, 0.0, 0))
     sink.end(
         EpisodeResult(
             seed=seed,

@@ -1,12 +1,16 @@
 import numpy as np
 import pytest
 import torch
+from any_robot import robot_of_size
 
 from imfvla.chunks import MIN_SCALE, ChunkFrame
 from imfvla.errors import UserError
+from imfvla.robot import RobotSpec
 from imfvla.statistics import Statistics
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
 STEPS, CHANNELS = 4, 16
+ARMS = bimanual_robot((), (8, 8))
 
 
 def example(rows=200):
@@ -20,7 +24,7 @@ def example(rows=200):
 
 def fitted(frame):
     state, action, statistics = example()
-    made = ChunkFrame(frame, STEPS, CHANNELS)
+    made = ChunkFrame(frame, STEPS, ARMS)
     made.fit(statistics)
     return made, state, action
 
@@ -54,12 +58,42 @@ def test_an_absolute_chunk_does_not_depend_on_the_state():
     assert torch.equal(made.normalise(action, state), made.normalise(action, state + 1))
 
 
+def test_two_arms_of_six_joints_have_all_joints_relative_and_both_grippers_absolute():
+    """14 channels, as ALOHA has: nothing may be guessed from the 16 of our own tasks."""
+    arm = (*(f"joint_{number} [rad]" for number in range(1, 7)), "gripper [0, 1]")
+    channels = tuple(f"{side}/{name}" for side in ("left", "right") for name in arm)
+    aloha = RobotSpec(
+        state=channels,
+        action=channels,
+        relative_to=tuple(None if index in (6, 13) else index for index in range(14)),
+        action_min=(-3.0,) * 14,
+        action_max=(3.0,) * 14,
+        control_hz=50.0,
+        cameras=(),
+    )
+    made = ChunkFrame("relative", STEPS, aloha)
+    made.normaliser.fit(torch.zeros(STEPS, 14), torch.ones(STEPS, 14), MIN_SCALE)
+    moved = made.denormalise(torch.zeros(1, STEPS, 14), torch.full((1, 14), 0.25))
+    expected = torch.full((1, STEPS, 14), 0.25).index_fill(2, torch.tensor([6, 13]), 0.0)
+    assert torch.equal(moved, expected)
+
+
+def test_an_action_may_displace_a_state_of_another_index_and_number():
+    robot = robot_of_size(8, 9)
+    made = ChunkFrame("relative", STEPS, robot)
+    made.normaliser.fit(torch.zeros(STEPS, 8), torch.ones(STEPS, 8), MIN_SCALE)
+    state = torch.arange(9.0).unsqueeze(0)
+    chunk = made.denormalise(torch.zeros(1, STEPS, 8), state)
+    assert chunk[0, 0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.0, 8.0]
+    assert torch.equal(made.normalise(chunk, state), torch.zeros(1, STEPS, 8))
+
+
 def test_still_channels_are_not_blown_up():
     state, action, _ = example()
     still = Statistics.of(
         state.numpy(), state.numpy(), np.zeros(action.shape), np.ones(action.shape[:2], bool)
     )
-    made = ChunkFrame("relative", STEPS, CHANNELS)
+    made = ChunkFrame("relative", STEPS, ARMS)
     made.fit(still)
     assert made.normaliser.scale[:, 0].tolist() == pytest.approx([MIN_SCALE] * STEPS)
 
@@ -80,4 +114,4 @@ def test_steps_that_are_not_valid_leave_the_statistics_alone():
 
 def test_an_unknown_frame_is_refused():
     with pytest.raises(UserError, match="action_frame must be relative or absolute, found 'polar'"):
-        ChunkFrame("polar", STEPS, CHANNELS)
+        ChunkFrame("polar", STEPS, ARMS)

@@ -35,7 +35,6 @@ def test_gives_plain_values():
     assert type(config) is type(config["horizon"]) is dict
     assert type(config["observation"]["views"]) is list
     assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4, "ensemble": None}
-    assert config["observation"]["num_views"] == len(config["observation"]["views"])
 
 
 def test_command_line_wins_over_experiment_over_scale():

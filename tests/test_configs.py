@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra.utils import instantiate
 from synthetic import write_demonstrations
 
 from imfvla.composition import CONFIG_DIRECTORY, compose
+from imfvla.construction import construct
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.nn.residual import AttentionResidual
 from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
-from imfvla.recording import Recordings
 from imfvla.reporting.mapping import read_mapping
 from imfvla.run_directory import RunDirectory
+from imfvla.sources.mcap import McapSource
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
@@ -52,8 +52,8 @@ def described(row) -> str:
     for scale in ("cpu", "paper"):
         config = compose("train", [f"+exp={row.experiment}", *row.overrides, f"scale={scale}"])
         with torch.device("meta"):
-            encoder = instantiate(config["encoder"], _convert_="all")
-            core = instantiate(config["core"], _convert_="all")
+            encoder = construct(config["encoder"], "encoder", views=3, state_dim=16)
+            core = construct(config["core"], "core", channels=16, state_token=-1)
         assert row.nfe in config["evaluation"]["nfe"]
         cells.append(
             (
@@ -82,7 +82,7 @@ def test_the_reading_of_each_printed_row_is_that_of_its_config(row):
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, tmp_path, monkeypatch):
     config = compose("train", [f"+exp={experiment}", *TINY])
-    windows = prepare_windows(config, Recordings.of(demonstrations))
+    windows = prepare_windows(config, McapSource.of(demonstrations))
     run = RunDirectory(tmp_path)
     run.claim(config)
 
@@ -129,7 +129,7 @@ def interrupt() -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations):
-    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), Recordings.of(demonstrations))
+    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), McapSource.of(demonstrations))
     config = compose("train", [f"+exp={experiment}", "scale=paper"])
     build(TrainingOptions, config["training"], "training")
     policy = build_policy(config, tiny.statistics())
@@ -154,7 +154,7 @@ def test_exec_beyond_pred_is_refused():
 
 def test_batches_depend_on_seed_and_number_alone(demonstrations):
     config = compose("train", TINY)
-    windows = prepare_windows(config, Recordings.of(demonstrations))
+    windows = prepare_windows(config, McapSource.of(demonstrations))
     one, other = make_loader(config, windows), make_loader(config, windows)
     next(one)
     other.load_state_dict(one.state_dict())

@@ -27,11 +27,10 @@ def test_the_actor_executes_the_mean():
     actor = ChunkActor(policy, policy.horizon, nfe=1, noise_seed=0)
     env.reset(seed=1)
     actor.reset(env, 1)
-    limits = env.action_spec()
     for step in range(12):
         decision = actor.act(env, env.state(), step)
         ensemble.add(step, decision.chunk)
-        expected = np.clip(ensemble.action(step), limits.minimum, limits.maximum)
+        expected = np.clip(ensemble.action(step), env.robot.action_min, env.robot.action_max)
         np.testing.assert_allclose(decision.executed, expected, rtol=1e-6)
         env.step(decision.executed)
 

@@ -237,7 +237,7 @@ def load_policy_alone(path: Path, step: int) -> tuple:
 
 def test_a_config_of_something_else_is_named(run):
     (run.path / "config.yaml").write_text("name: other\ntask: {name: socket}\n")
-    with pytest.raises(UserError, match=r"lacks task\.variant, observation\.views, observation\.image_size"):
+    with pytest.raises(UserError, match=r"lacks observation\.views, observation\.image_size"):
         roll(run)
 
 

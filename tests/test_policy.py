@@ -23,7 +23,8 @@ STATISTICS = SimpleNamespace(
 def config(**changes):
     return {
         "horizon": {"obs": 1, "pred": 8, "exec": 4},
-        "action_dim": 16,
+        "task": {"name": "socket"},
+        "observation": {"views": ["front", "top"], "image_size": [32, 32]},
         "action_frame": "absolute",
         "encoder": {
             "_target_": "imfvla.encoders.observation.ObservationEncoder",
@@ -32,9 +33,7 @@ def config(**changes):
                 "hidden": (8, 8),
                 "channels": 4,
             },
-            "views": 2,
             "observed_steps": 1,
-            "state_dim": 16,
             "width": 16,
             "image_size": (32, 32),
             "view_tokens": {"_target_": "imfvla.encoders.tokens.GridTokens", "_partial_": True, "tokens": 1},
@@ -42,7 +41,6 @@ def config(**changes):
         "core": {
             "_target_": "imfvla.nn.transformer.TransformerCore",
             "steps": 8,
-            "channels": 16,
             "width": 16,
             "depth": 2,
             "heads": 2,

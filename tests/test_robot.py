@@ -44,6 +44,10 @@ def test_a_channel_is_a_name_and_a_unit(channel, name, unit):
             {"state": ("a [rad]", "a [m]", "b")},
             "robot.state must be names that all differ, found 'a more than once'",
         ),
+        (
+            {"state": ("a [rad]", "a/b [rad]", "c")},
+            "robot.state must be channels that are no group of others, found 'a as both'",
+        ),
         ({"relative_to": (1,)}, "robot.relative_to must be 2 values"),
         (
             {"relative_to": (3, None)},

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from fakes import FakeEnvironment, known_actions
+from fakes import ROBOT, FakeEnvironment, known_actions
 
-from imfvla.episode import ACTION_DIM, Decision, EpisodeInfo, EpisodeResult, Step
+from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.recording import McapSink, read_episode
 from imfvla.rollout import NON_FINITE, SIMULATION_ENDED, ActionError, run_episode
 
@@ -104,7 +104,7 @@ def test_recorders_see_each_step_with_the_state_before_and_the_stage_after():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_non_finite_action_ends_the_episode_with_a_label(bad):
     env, recorder = FakeEnvironment(), Recorder()
-    action = np.full(ACTION_DIM, bad, np.float32)
+    action = np.full(len(ROBOT.action), bad, np.float32)
     result = play(ScriptedActor({30: lambda: Decision(action, action)}), env=env, sinks=[recorder])
     assert (result.failure, result.num_steps, result.success) == (NON_FINITE, 30, False)
     assert result.max_reward == 3
@@ -137,7 +137,7 @@ def test_any_other_exception_aborts_all_recorders_and_is_raised_again():
 
 
 def test_an_episode_with_a_label_is_recorded_whole(tmp_path):
-    action = np.full(ACTION_DIM, np.nan, np.float32)
+    action = np.full(len(ROBOT.action), np.nan, np.float32)
     actor = ScriptedActor({6: lambda: Decision(action, action)})
     play(actor, sinks=[McapSink(tmp_path / "failed.mcap", render_every=2)])
     episode = read_episode(tmp_path / "failed.mcap")

@@ -53,7 +53,7 @@ def launch(arguments: list[str], directory: Path, **environment: str) -> subproc
 def main(config: dict[str, Any]) -> None:
     from imfvla import experiment
     from imfvla.evaluation import evaluate
-    from imfvla.recording import Recordings
+    from imfvla.sources.mcap import McapSource
 
     if config["seed"] == 13:
         raise UserError("seed 13 is bad.")
@@ -70,7 +70,7 @@ def main(config: dict[str, Any]) -> None:
 
     with (
         mock.patch.object(
-            experiment, "ensure_demonstrations", lambda config: Recordings.of(config["demos"]["directory"])
+            experiment, "open_source", lambda config: McapSource.of(config["demos"]["directory"])
         ),
         mock.patch.object(
             experiment,
@@ -87,10 +87,10 @@ def build(run: Path, step: int) -> tuple[Any, Any]:
     """A `workbench.Build`: the trained policy in a scene whose stages depend on time and seed."""
     from fakes import FakeEnvironment
 
+    from imfvla.tasks.bimanual_robot import bimanual_robot
     from imfvla.training.checkpoint import load_policy
 
-    env = FakeEnvironment()
-    env.views, env.image_size = ("front", "top", "r_wrist"), (32, 32)
+    env = FakeEnvironment(robot=bimanual_robot(("front", "top", "r_wrist"), (32, 32)))
     return env, load_policy(RunDirectory(run), step)
 
 

@@ -44,7 +44,7 @@ from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
 from imfvla.files import write_json
 from imfvla.nn.pretrained import read_weights
-from imfvla.recording import Recordings, read_episode, read_index
+from imfvla.recording import read_episode, read_index
 from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.episodes import read_episodes
@@ -52,6 +52,7 @@ from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.runs import evaluations
 from imfvla.rollout_log import PARTIAL, RolloutLog
 from imfvla.run_directory import RunDirectory
+from imfvla.sources.mcap import McapSource
 from imfvla.training.checkpoint import TrainState, load_state, load_weights, save_state, save_weights
 from imfvla.training.logger import read_metrics
 
@@ -293,7 +294,7 @@ def make_targets(folder: Path) -> dict[str, Target]:
     write_json(depth, {"experiment": "x", "checkpoint_step": 3, **weights})
     store = folder / "store"
     demos = write_demonstrations(folder / "demos", num_episodes=2, num_steps=4)
-    FrameStore.build(Recordings.of(demos), store, (16, 16), ("front",))
+    FrameStore.build(McapSource.of(demos), store, (16, 16), ("front",))
     options = folder / "options.json"
     write_json(options, compose("train", TINY))
     tables = folder / "tables.yaml"

@@ -20,7 +20,7 @@ import numpy as np
 
 from imfvla.actor import ChunkActor
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
-from imfvla.modes.grippers import release_delay
+from imfvla.modes.grippers import grippers_of, release_delay
 from imfvla.progress import Progress
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
@@ -49,12 +49,13 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
     env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())
+    taking, giving = grippers_of(env.robot)  # the left hand takes
     log, delays = ActionLog(), {True: Counter(), False: Counter()}
     actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
     with Progress("hand-overs", arguments.episodes) as progress:
         for seed in range(arguments.first_seed, arguments.first_seed + arguments.episodes):
             result = run_episode(env, actor, seed, [log], kind="rollout", config={})
-            delays[result.success][release_delay(np.stack(log.actions))] += 1
+            delays[result.success][release_delay(np.stack(log.actions), taking, giving)] += 1
             progress.advance()
     for success, counts in delays.items():
         ordered = sorted(counts.items(), key=lambda item: (item[0] is None, item[0]))

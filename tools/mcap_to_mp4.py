@@ -3,8 +3,8 @@
 python tools/mcap_to_mp4.py episode.mcap                   # writes episode.mp4 beside it, unless that exists
 python tools/mcap_to_mp4.py episode.mcap -o film.mp4 --views front top
 
-A frame stays until the next one: a policy that looks once in 16 steps changes the picture about 3 times a second, while
-the caption keeps updating time, stage and return.
+A frame stays until the next one. A policy that seldom looks seldom changes the picture, while the caption keeps
+updating time, stage and return.
 """
 
 from imfvla.command import as_command, begin
@@ -19,20 +19,19 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.episode import CONTROL_HZ
 from imfvla.errors import UserError
 from imfvla.recording import Episode, read_episode, write_mp4
-from imfvla.recording.video import side_by_side
-
-FRAME_STEPS = 2  # control steps between two pictures of a video: 25 a second
+from imfvla.recording.video import side_by_side, status_line, steps_between_frames
 
 
 def frames(episode: Episode, every: int) -> Iterator[np.ndarray]:
     """Captioned pictures uint8 (H, W, 3) of every `every`-th control step: what was seen last before it or at it."""
     returns = episode.reward.cumsum()
+    has_stages = bool(episode.result.first_step_of_stage)
     for step in range(episode.image_steps[0], len(episode.state), every):
         row = np.searchsorted(episode.image_steps, step, side="right") - 1
-        status = f"{episode.time_s[step]:5.2f} s  stage {episode.stage[step]}  return {returns[step]:.0f}"
+        stage = episode.stage[step] if has_stages else None
+        status = status_line(episode.time_s[step], stage, returns[step])
         pictures = [episode.images[view][row] for view in episode.images]
         yield side_by_side(pictures, f"{episode.info.task}  seed {episode.info.seed}  {status}")
 
@@ -43,8 +42,10 @@ def export(source: Path, target: Path, views: list[str] | None) -> None:
     if not len(episode.image_steps):
         raise UserError(f"{source} holds no frames that all of its views share: there is nothing to show.")
     # A step that the video passes over would hide its frame.
-    every = FRAME_STEPS if (np.diff(episode.image_steps) % FRAME_STEPS == 0).all() else 1
-    write_mp4(target, frames(episode, every), CONTROL_HZ / every)
+    control_hz = episode.info.robot.control_hz
+    usual = steps_between_frames(control_hz)
+    every = usual if (np.diff(episode.image_steps) % usual == 0).all() else 1
+    write_mp4(target, frames(episode, every), control_hz / every)
 
 
 def check_target(target: Path, overwrite: bool) -> None:

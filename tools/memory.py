@@ -25,8 +25,8 @@ import psutil
 from imfvla.composition import compose
 from imfvla.options import build
 from imfvla.policy import build_policy
-from imfvla.recording import Recordings
 from imfvla.run_directory import RunDirectory
+from imfvla.sources.mcap import McapSource
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -55,9 +55,9 @@ def resets(count: int, watch: Watch) -> None:
     from imfvla import tasks  # here, since a GL backend is picked at import
 
     env = tasks.load("socket", image_size=(32, 32))
-    action = np.zeros(env.action_spec().shape)
+    action = np.zeros(len(env.robot.action))
     for seed in range(100_000, 100_000 + count):
-        env.reset(seed=seed)
+        env.reset(seed)
         env.look()
         for _ in range(2):
             env.step(action)
@@ -79,7 +79,7 @@ def training(count: int, watch: Watch) -> None:
     ]
     config = compose("train", [*sizes, *pace])
     with tempfile.TemporaryDirectory(prefix="imfvla-memory-") as folder:
-        windows = prepare_windows(config, Recordings.of(write_demonstrations(Path(folder) / "demos")))
+        windows = prepare_windows(config, McapSource.of(write_demonstrations(Path(folder) / "demos")))
         Trainer(
             build_policy(config, windows.statistics()),
             Watched(make_loader(config, windows), watch),

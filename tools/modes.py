@@ -22,6 +22,7 @@ from imfvla.errors import UserError
 from imfvla.figures.modes import modes_figure
 from imfvla.figures.style import render
 from imfvla.files import write_json, write_together
+from imfvla.modes.grippers import grippers_of
 from imfvla.modes.observations import Stops
 from imfvla.modes.recordings import (
     SELECTION_FIRST_SEED,
@@ -73,7 +74,8 @@ def main() -> int:
     else:
         paths = choose_recordings(config, arguments.demos, first_seed, episodes)
     settings = settings_of(config)
-    stops = Stops(policy.horizon, settings.views, len(paths), arguments.observations)
+    grippers = grippers_of(policy.robot)
+    stops = Stops(policy.horizon, settings.views, grippers, len(paths), arguments.observations)
     for path in paths:
         stops.add(read_demonstration(path, settings))
     stops.finish()

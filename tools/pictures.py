@@ -17,14 +17,14 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from imfvla.actor import ChunkActor
 from imfvla.composition import compose
-from imfvla.episode import CONTROL_HZ
+from imfvla.environment import Environment
+from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.figures.contact_sheet import contact_sheet, png
 from imfvla.files import write_together
@@ -33,6 +33,7 @@ from imfvla.publication import publish
 from imfvla.reporting.mapping import read_mapping
 from imfvla.rollout import run_episode
 from imfvla.run_directory import RunDirectory
+from imfvla.tasks.bimanual_robot import CONTROL_HZ, TIME_LIMIT_STEPS
 from imfvla.workbench import load_workbench
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,7 +41,8 @@ RESULTS, SHIPPED = ROOT / "experiments" / "results", ROOT / "experiments" / "pre
 FIGURES = {  # picture -> figure of imfvla.report
     name: name for name in ("evaluations", "failures", "learning", "depth_attention")
 } | {"reward_latency": "figure3_reward_latency"}
-STEPS = (0, 140, 280, 420, 560, 700)  # control steps after which a rollout is shown
+MOMENTS = 6  # of a rollout, start and end among them
+STEPS = [round(share * TIME_LIMIT_STEPS) for share in np.linspace(0, 1, MOMENTS)]
 TIMES = [f"{step / CONTROL_HZ:g} s" for step in STEPS]
 SIZE = 216  # px of a picture in a rollout
 ROLLOUTS = (  # median and worst as `evaluation.best_median_worst` finds them
@@ -58,20 +60,20 @@ class Snapshots:
     def __init__(self, view: str = "front") -> None:
         self.view, self.pictures, self.instruction = view, [], ""
 
-    def begin(self, env: Any, info: Any) -> None:
+    def begin(self, env: Environment, info: EpisodeInfo) -> None:
         self.instruction = info.instruction
         self._show(env, 0)
 
-    def step(self, env: Any, step: Any) -> None:
+    def step(self, env: Environment, step: Step) -> None:
         self._show(env, step.index + 1)
 
-    def end(self, result: Any) -> None:
+    def end(self, result: EpisodeResult) -> None:
         pass
 
     def abort(self) -> None:
         pass
 
-    def _show(self, env: Any, done: int) -> None:
+    def _show(self, env: Environment, done: int) -> None:
         if done in STEPS:
             self.pictures.append(env.render(self.view, SIZE, SIZE))
 
@@ -165,7 +167,7 @@ def expert() -> bytes:
         return first.read_bytes()
 
 
-def _played(run: Path, seed: int) -> tuple[Snapshots, Any]:
+def _played(run: Path, seed: int) -> tuple[Snapshots, EpisodeResult]:
     env, policy = load_workbench(run, RunDirectory(run).weights_step("last"))
     actor, shown = ChunkActor(policy, policy.horizon, NFE, NOISE_SEED), Snapshots()
     return shown, run_episode(env, actor, seed, [shown], kind="rollout", config={})

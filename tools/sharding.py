@@ -29,8 +29,10 @@ import torch
 from torch import Tensor
 
 from imfvla.composition import compose
+from imfvla.instruction import MAX_WORDS
 from imfvla.options import build
 from imfvla.policy import build_policy
+from imfvla.robot_of import robot_of
 from imfvla.run_directory import RunDirectory
 from imfvla.statistics import Statistics
 from imfvla.training.checkpoint import save_state
@@ -53,15 +55,17 @@ class Noise:
     def __init__(self, config: dict[str, Any]) -> None:
         rng = torch.Generator().manual_seed(0)
         count, horizon = config["training"]["batch_size"], config["horizon"]
-        pictures = (count, horizon["obs"], config["observation"]["num_views"], 3)
+        robot, views = robot_of(config), config["observation"]["views"]
+        pictures = (count, horizon["obs"], len(views), 3)
         observation = Observation(
             torch.randint(
                 256, (*pictures, *config["observation"]["image_size"]), dtype=torch.uint8, generator=rng
             ),
-            torch.rand(count, horizon["obs"], config["state_dim"], generator=rng),
-            torch.ones(count, 16, dtype=torch.int64),
+            torch.rand(count, horizon["obs"], len(robot.state), generator=rng),
+            torch.ones(count, MAX_WORDS, dtype=torch.int64),
         )
-        actions = torch.rand(count, horizon["pred"], config["action_dim"], generator=rng)
+        actions = torch.rand(count, horizon["pred"], len(robot.action), generator=rng)
+        self.origin = robot.origin
         self.batch = Batch(observation, actions, torch.ones(count, horizon["pred"], dtype=torch.bool))
 
     def __next__(self) -> Batch:
@@ -70,7 +74,8 @@ class Noise:
 
     def statistics(self) -> Statistics:
         state, actions = self.batch.obs.state[:, -1].numpy(), self.batch.actions.numpy()
-        return Statistics.of(state, actions[:, 0], actions - state[:, None], self.batch.valid.numpy())
+        displaced = actions - state[:, None, self.origin]
+        return Statistics.of(state, actions[:, 0], displaced, self.batch.valid.numpy())
 
     def describe(self, number: int) -> list[str]:
         return [f"noise {row}" for row in range(len(self.batch.actions))]

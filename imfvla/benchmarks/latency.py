@@ -1,7 +1,6 @@
 """The time of one action chunk at batch 1 on one thread, from numpy observation to numpy chunk, and its parts."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -9,16 +8,18 @@ import torch
 from imfvla.actor import ChunkActor
 from imfvla.benchmarks.clock import threads, times_ms
 from imfvla.benchmarks.sizes import core_inputs
+from imfvla.environment import Environment
 from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
+from imfvla.resample import resample
 from imfvla.types import Observation
 
 FEWEST_CALLS = 50  # of a sampler with many steps
 
 
 def measure_latency(
-    env: Any, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
+    env: Environment, policy: Policy, nfe: Sequence[int], *, calls: int, warm_up: int, num_threads: int = 1
 ) -> dict[str, dict[str, float]]:
     """Times [ms] by "infer1", ...: median and p95 of a chunk, and the medians of its parts.
 
@@ -30,9 +31,12 @@ def measure_latency(
     """
     env.reset(seed=0)
     obs = policy.horizon.obs
-    images, states = [np.stack(list(env.look().values()))] * obs, [env.state()] * obs
+    seen = env.look()
+    pictures = [seen[view] for view in policy.views]
+    images, states = [pictures] * obs, [env.state()] * obs
+    fitted = np.stack([resample(picture, policy.image_size) for picture in pictures])
     observation = Observation(
-        images=torch.from_numpy(np.stack(images)).permute(0, 1, 4, 2, 3).unsqueeze(0),
+        images=torch.from_numpy(np.stack([fitted] * obs)).permute(0, 1, 4, 2, 3).unsqueeze(0),
         state=torch.from_numpy(np.stack(states)).unsqueeze(0),
         instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
     )

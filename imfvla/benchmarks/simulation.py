@@ -1,29 +1,35 @@
-"""Physics, control steps, rendered views and demonstrations of a task."""
+"""Physics, control steps, rendered views and demonstrations of an environment."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from imfvla import tasks
 from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.collection import collect
+from imfvla.environment import Environment, bodies_of
 from imfvla.recording import Recordings
 
 MEASURE_S = 1.0  # seconds of each rate
 FRAMES = 50  # rendered per view
 
 
-def measure_simulation(env: Any) -> dict[str, float]:
-    """Rates of one process [1/s] and the median time of a frame [ms], averaged over the views."""
-    env.reset(seed=0)
-    hold = env.state()
+def measure_simulation(env: Environment) -> dict[str, float]:
+    """Rates of one process [1/s] and the median time of a frame [ms], averaged over the views.
+
+    Physics are timed where the environment shows its simulator and that has steps of its own.
+    """
+    env.reset(0)
+    hold = _rest(env)
     control = rate(lambda: _step(env, hold), MEASURE_S)
-    physics = rate(env.physics.step, MEASURE_S)
-    frames = times_ms([lambda view=view: env.look([view]) for view in env.views], FRAMES)
+    simulator = bodies_of(env)
+    physics = {"physics_steps_per_s": rate(simulator.step, MEASURE_S)} if hasattr(simulator, "step") else {}
+    cameras = [env.robot.camera(view) for view in env.views]
+    frames = times_ms([partial(env.render, c.name, c.height, c.width) for c in cameras], FRAMES)
     return {
-        "physics_steps_per_s": physics,
+        **physics,
         "control_steps_per_s": control,
         "ms_per_view": float(np.median(frames, axis=1).mean()),
     }
@@ -40,17 +46,13 @@ def measure_demonstrations(config: Mapping[str, Any], directory: Path) -> tuple[
     return {"demonstrations_per_min": 60 * report.num_new / report.wall_s}, report.recordings
 
 
-def make_environment(config: Mapping[str, Any]) -> Any:
-    """The environment of a composed config."""
-    observation = config["observation"]
-    return tasks.load(
-        config["task"]["name"],
-        variant=config["task"]["variant"],
-        views=tuple(observation["views"]),
-        image_size=tuple(observation["image_size"]),
-    )
+def _rest(env: Environment) -> np.ndarray:
+    """Actions (A,) that move little: where the state is, and otherwise the middle of the limits."""
+    robot = env.robot
+    middle = np.mean([robot.action_min, robot.action_max], axis=0)
+    return np.where(robot.relative, env.state()[robot.origin], middle)
 
 
-def _step(env: Any, action: Any) -> None:
-    if env.step(action).last():
-        env.reset(seed=0)
+def _step(env: Environment, action: np.ndarray) -> None:
+    if env.step(action).ended:
+        env.reset(0)

@@ -18,7 +18,7 @@ def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any
     A chunk costs the encoder with its conditioning once and `n` calls of the core, for each n of `nfe`.
     """
     policy = build_unfitted(config)
-    observation, noise = blank_observation(config), torch.zeros(1, *policy.noise_shape)
+    observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
     encoder = count_flops(lambda: policy.core.condition(policy.encoder(observation)))
     inputs = core_inputs(policy.eval(), observation, noise)
     core = count_flops(lambda: policy.core(*inputs))

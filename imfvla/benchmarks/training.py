@@ -14,8 +14,8 @@ from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
 from imfvla.policy import Policy
-from imfvla.recording import Recordings
 from imfvla.run_directory import RunDirectory
+from imfvla.sources.base import EpisodeSource
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -26,9 +26,9 @@ GEMM = 2048  # rows and columns of the matrices that the peak is measured with
 
 
 def measure_training(
-    config: Mapping[str, Any], policy: Policy, demonstrations: Recordings, scratch: Path, steps: int
+    config: Mapping[str, Any], policy: Policy, demonstrations: EpisodeSource, scratch: Path, steps: int
 ) -> dict[str, Any]:
-    """Trains `policy` for a few steps on recorded demonstrations, as `imfvla.train` would, and times the parts.
+    """Trains `policy` for a few steps on demonstrations, as `imfvla.train` would, and times the parts.
 
     The parts are means over `steps` steps [ms]: waiting for data, encoder and conditioning, core and loss
     without the Jacobian-vector product, that product, backward, and clipping with optimiser and average

@@ -1,10 +1,11 @@
-"""Recorded episodes as memory-mapped arrays, decoded once for all epochs and runs.
+"""Episodes of any source as memory-mapped arrays, decoded once for all epochs and runs.
 
 Shapes: N frames, V views, H W pixels, T control steps of all episodes, S state, A action.
 """
 
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections import deque
@@ -14,15 +15,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.files import locked, write_remedy
-from imfvla.recording import Episode, Recordings, read_episode, read_index
+from imfvla.resample import resample
+from imfvla.sources.base import EpisodeArrays, EpisodeSource
+from imfvla.sources.validation import check_episode
 
-FORMAT = 1
+FORMAT = 2
 IMAGES = "images.raw"
 FILES = {IMAGES, "image_steps.npy", "state.npy", "action.npy", "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
@@ -34,7 +36,7 @@ Progress = Callable[[int, int], None]  # called with (episodes done, episodes in
 class StoredEpisode:
     """Where an episode lies in the store's arrays."""
 
-    file: str
+    name: str
     task: str
     instructions: tuple[str, ...]  # the recorded sentence, then its paraphrases
     num_steps: int
@@ -45,7 +47,7 @@ class StoredEpisode:
 
 @dataclass(frozen=True, slots=True)
 class FrameStore:
-    """Arrays of all episodes, one after the other, in the order of their file names."""
+    """Arrays of all episodes, one after the other, in the order of their source."""
 
     path: Path
     views: tuple[str, ...]
@@ -86,59 +88,50 @@ class FrameStore:
     @classmethod
     def build(
         cls,
-        recordings: Recordings,
+        source: EpisodeSource,
         store_path: str | Path,
         image_size: Sequence[int],
         views: Sequence[str],
         *,
         progress: Progress | None = None,
     ) -> "FrameStore":
-        """The store of these recordings; an existing one is kept while it is up to date.
+        """The store of these episodes; an existing one is kept while it is up to date.
 
-        It is out of date once files, views or image size differ. Episodes are decoded a few at a time,
-        so memory stays low; frames of another size are resampled. Raises UserError where recordings are
+        It is out of date once the source's digest, views or image size differ. Episodes are decoded a few at a time,
+        so memory stays low; frames of another size are resampled. Raises UserError where episodes are
         missing, damaged or without a view, where nothing can be written, and where something else is at
         `store_path`; an existing store is only replaced by a complete one. Concurrent builds wait for
         each other.
         """
         store_path = Path(store_path)
-        source = _source(recordings.files, tuple(views), tuple(image_size))
+        for view in views:
+            source.robot.camera(view)
+        meta = _meta(source, tuple(views), tuple(image_size))
         with locked(store_path):
-            if not _is_current(store_path, source):
-                _write(recordings.files, store_path, source, progress or (lambda done, total: None))
+            if not _is_current(store_path, meta):
+                _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
 
 
-def _source(files: Sequence[Path], views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
+def _meta(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
     """What a store is made from; its digest shows whether the store is up to date."""
-    digest = hashlib.sha256(json.dumps([FORMAT, views, image_size]).encode())
-    num_frames = 0
-    for file in files:
-        index = read_index(file)
-        digest.update(json.dumps([file.name, index.num_bytes, index.data_crc]).encode())
-        num_frames += max((index.num_frames.get(view, 0) for view in views), default=0)
-    if num_frames == 0:
-        raise UserError(
-            f"The recordings in {files[0].parent} have no frames of {', '.join(views) or 'any view'}: "
-            "change observation.views, or collect again with these views."
-        )
+    content = json.dumps([FORMAT, views, image_size, source.digest()])
     return {
         "format": FORMAT,
-        "digest": digest.hexdigest(),
+        "digest": hashlib.sha256(content.encode()).hexdigest(),
         "views": list(views),
         "image_size": list(image_size),
-        "num_frames": num_frames,
     }
 
 
-def _is_current(store_path: Path, source: dict[str, Any]) -> bool:
+def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
     try:
-        return read_json(store_path / "meta.json", "", mapping=True).get("digest") == source["digest"]
+        return read_json(store_path / "meta.json", "", mapping=True).get("digest") == meta["digest"]
     except UserError:
         return False
 
 
-def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], progress: Progress) -> None:
+def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progress: Progress) -> None:
     """Writes a complete store beside `store_path` and moves it there."""
     if store_path.exists() and not (store_path.is_dir() and set(os.listdir(store_path)) <= FILES):
         raise UserError(
@@ -146,8 +139,7 @@ def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], prog
             "folder with demos.frames_directory."
         )
     part = store_path.with_name(f".{store_path.name}.part")
-    height, width = source["image_size"]
-    needed = source["num_frames"] * len(source["views"]) * 3 * height * width
+    needed = _num_frames(source, meta["views"]) * len(meta["views"]) * 3 * math.prod(meta["image_size"])
     try:
         store_path.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(part, ignore_errors=True)
@@ -158,7 +150,7 @@ def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], prog
                 "space, choose another disk with demos.frames_directory, or lower observation.image_size or the "
                 "number of views."
             )
-        _write_arrays(files, part, source, progress)
+        _write_arrays(source, part, meta, progress)
         shutil.rmtree(store_path, ignore_errors=True)
         part.rename(store_path)
     except OSError as error:
@@ -170,15 +162,26 @@ def _write(files: Sequence[Path], store_path: Path, source: dict[str, Any], prog
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_arrays(files: Sequence[Path], part: Path, source: dict[str, Any], progress: Progress) -> None:
+def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
+    """Frames of each view. Raises UserError where there are none."""
+    found = sum(source.num_frames(index) for index in range(len(source)))
+    if found == 0:
+        raise UserError(
+            f"The {len(source)} episodes of demos have no frames of {', '.join(views)}: change observation.views, or "
+            "collect again with these views."
+        )
+    return found
+
+
+def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress) -> None:
     entries, steps, states, actions = [], [], [], []
     with open(part / IMAGES, "wb") as stream:
-        for episode, frames in _decoded(files, source["views"], source["image_size"]):
+        for episode, frames in _decoded(source, meta["views"], meta["image_size"]):
             stream.write(frames)
             entry = {
-                "file": episode.path.name,
-                "task": episode.info.task,
-                "instructions": [episode.info.instruction, *episode.info.metadata.get("paraphrases", ())],
+                "name": episode.name,
+                "task": episode.task,
+                "instructions": list(episode.instructions),
                 "num_steps": len(episode.state),
                 "num_frames": len(episode.image_steps),
             }
@@ -186,11 +189,11 @@ def _write_arrays(files: Sequence[Path], part: Path, source: dict[str, Any], pro
             steps.append(episode.image_steps)
             states.append(episode.state)
             actions.append(episode.action)
-            progress(len(entries), len(files))
+            progress(len(entries), len(source))
     _save(part / "image_steps.npy", np.concatenate(steps))
     _save(part / "state.npy", np.concatenate(states))
     _save(part / "action.npy", np.concatenate(actions))
-    (part / "meta.json").write_text(json.dumps(source | {"episodes": entries}, indent=1), encoding="utf-8")
+    (part / "meta.json").write_text(json.dumps(meta | {"episodes": entries}, indent=1), encoding="utf-8")
 
 
 def _save(path: Path, array: np.ndarray) -> None:
@@ -203,29 +206,27 @@ def _load(path: Path) -> np.ndarray:
 
 
 def _decoded(
-    files: Sequence[Path], views: Sequence[str], image_size: Sequence[int]
-) -> Iterator[tuple[Episode, np.ndarray]]:
+    source: EpisodeSource, views: Sequence[str], image_size: Sequence[int]
+) -> Iterator[tuple[EpisodeArrays, np.ndarray]]:
     """Episodes in order with their frames, decoded by threads that stay a few episodes ahead."""
-    ahead: deque[Future[tuple[Episode, np.ndarray]]] = deque()
+    ahead: deque[Future[tuple[EpisodeArrays, np.ndarray]]] = deque()
     with ThreadPoolExecutor(NUM_DECODERS) as threads:
-        for file in files:
-            ahead.append(threads.submit(_decode, file, views, image_size))
+        for index in range(len(source)):
+            ahead.append(threads.submit(_decode, source, index, views, image_size))
             if len(ahead) > 2 * NUM_DECODERS:
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
 
 
-def _decode(file: Path, views: Sequence[str], image_size: Sequence[int]) -> tuple[Episode, np.ndarray]:
+def _decode(
+    source: EpisodeSource, index: int, views: Sequence[str], image_size: Sequence[int]
+) -> tuple[EpisodeArrays, np.ndarray]:
     """The episode and its frames: contiguous uint8 (K, V, 3, H, W)."""
-    episode = read_episode(file, images=views)
-    if not (np.isfinite(episode.state).all() and np.isfinite(episode.action).all()):
-        raise UserError(f"Recording {file} has a state or an action that is not finite: move it away.")
-    height, width = image_size
-    frames = np.empty((len(episode.image_steps), len(views), 3, height, width), np.uint8)
+    episode = source.episode(index, views)
+    check_episode(episode, source.robot, views)
+    frames = np.empty((len(episode.image_steps), len(views), 3, *image_size), np.uint8)
     for number, view in enumerate(views):
         for frame, picture in zip(frames[:, number], episode.images[view], strict=True):
-            if picture.shape[:2] != (height, width):
-                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-            frame[...] = picture.transpose(2, 0, 1)
+            frame[...] = resample(picture, image_size).transpose(2, 0, 1)
     return replace(episode, images={}), frames

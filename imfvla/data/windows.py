@@ -3,6 +3,8 @@
 Shapes: B batch, W windows, To observed steps, Tp predicted steps, V views, L instruction words.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 
@@ -10,6 +12,7 @@ from imfvla.data.frame_store import FrameStore
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
+from imfvla.robot import RobotSpec
 from imfvla.statistics import Statistics
 from imfvla.types import Batch, Observation
 
@@ -19,17 +22,27 @@ class Windows:
 
     A step is a decision if every step that `Horizon.observed_steps` names for it has frames. With `obs=1`
     these are all steps with frames. With `obs>=2` a rollout sees consecutive control steps, so the
-    recordings must have frames at every step (`camera_every=1`), or where a policy of the same horizon
-    saw them; recordings with gaps would leave only the first step of each episode and are refused with a
+    episodes must have frames at every step (`camera_every=1`), or where a policy of the same horizon
+    saw them; episodes with gaps would leave only the first step of each episode and are refused with a
     UserError.
 
     With `paraphrases` an item's sentence is drawn from the recorded one and its paraphrases, otherwise it is the
-    recorded one.
+    recorded one. `episodes` are those of the store that count, by number; None for all.
     """
 
-    def __init__(self, store: FrameStore, horizon: Horizon, *, paraphrases: bool = True) -> None:
+    def __init__(
+        self,
+        store: FrameStore,
+        horizon: Horizon,
+        robot: RobotSpec,
+        *,
+        paraphrases: bool = True,
+        episodes: Collection[int] | None = None,
+    ) -> None:
         self.store = store
+        self.chosen = range(len(store.episodes)) if episodes is None else sorted(episodes)
         self.horizon = horizon
+        self.robot = robot
         self._index_windows()
         self._index_instructions(paraphrases)
 
@@ -50,20 +63,34 @@ class Windows:
         actions = torch.from_numpy(self.store.action[self._followed[indices]])
         return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
 
+    def decided(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Without pictures: states (B, S) at the decisions `indices`, actions (B, Tp, A) and valid (B, Tp)."""
+        state = self.store.state[self._observed[indices, -1]]
+        return state, self.store.action[self._followed[indices]], self._valid[indices]
+
     def describe(self, indices: np.ndarray) -> list[str]:
-        """Episode file and decision step of each window."""
-        files = [self.store.episodes[number].file for number in self.episodes[indices]]
-        return [f"{file}, step {step}" for file, step in zip(files, self.steps[indices], strict=True)]
+        """Episode and decision step of each window."""
+        names = [self.store.episodes[number].name for number in self.episodes[indices]]
+        return [f"{name}, step {step}" for name, step in zip(names, self.steps[indices], strict=True)]
 
     def statistics(self) -> Statistics:
         """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
-        store = self.store
-        displacement = store.action[self._followed] - store.state[self._observed[:, -1:]]
-        return Statistics.of(store.state, store.action, displacement, self._valid)
+        store, rows = self.store, self._rows()
+        decided_at = store.state[self._observed[:, -1:]]
+        displacement = store.action[self._followed] - decided_at[..., self.robot.origin]
+        return Statistics.of(store.state[rows], store.action[rows], displacement, self._valid)
+
+    def _rows(self) -> np.ndarray | slice:
+        """The rows of the store's states and actions that belong to the chosen episodes."""
+        if len(self.chosen) == len(self.store.episodes):
+            return slice(None)
+        chosen = [self.store.episodes[number] for number in self.chosen]
+        return np.concatenate([np.arange(one.num_steps) + one.first_row for one in chosen])
 
     def _index_windows(self) -> None:
         episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []
-        for number, episode in enumerate(self.store.episodes):
+        for number in self.chosen:
+            episode = self.store.episodes[number]
             frame_at = np.full(episode.num_steps, -1)
             frame_at[episode.image_steps] = episode.first_frame + np.arange(len(episode.image_steps))
             for step in episode.image_steps:
@@ -80,7 +107,7 @@ class Windows:
         if not steps or (self.horizon.obs > 1 and not any(steps)):
             raise UserError(
                 f"horizon.obs={self.horizon.obs} needs frames at that many consecutive control steps, and "
-                f"the recordings in {self.store.path} have none: collect with camera_every=1, or set "
+                f"the episodes in {self.store.path} have none: collect with camera_every=1, or set "
                 "horizon.obs=1."
             )
         self.episodes = np.array(episodes)  # (W,)  number of the episode in the store

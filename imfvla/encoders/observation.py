@@ -14,7 +14,7 @@ from imfvla.instruction import NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.types import Observation
 
-MIN_STATE_SCALE = 5e-3  # rad, or share of a gripper's opening
+MIN_STATE_SCALE = 5e-3  # in the unit of the channel: rad, m, a share of an opening
 
 
 class ObservationEncoder(nn.Module):
@@ -26,6 +26,7 @@ class ObservationEncoder(nn.Module):
     """
 
     last_token = "summary"
+    state_token = -3  # of the last step; the sentence and the summary follow
 
     def __init__(
         self,

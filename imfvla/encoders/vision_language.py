@@ -18,7 +18,7 @@ from imfvla.nn.normaliser import Normaliser
 from imfvla.nn.pretrained import Backbone
 from imfvla.types import Observation
 
-MIN_STATE_SCALE = 5e-3  # rad, or share of a gripper's opening
+MIN_STATE_SCALE = 5e-3  # in the unit of the channel: rad, m, a share of an opening
 
 
 class TextEncoder(nn.Module):
@@ -56,6 +56,7 @@ class VisionLanguageEncoder(Backbone, nn.Module):
 
     key = "encoder"
     last_token = "state"
+    state_token = -1
     own = ("state.", "state_normaliser.")  # what is never pretrained
 
     def __init__(

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from imfvla.robot_of import robot_of
+
 VISION = {"CompactCNN": "compact CNN", "CompactResNet": "compact ResNet", "ResNet18": "ResNet18"}
 CORE = {
     "TransformerCore": "one token sequence",
@@ -86,7 +88,7 @@ def describe(config: Mapping[str, Any]) -> Method:
         views=tuple(config["observation"]["views"]),
         image_size=tuple(config["observation"]["image_size"]),
         observed_steps=config["horizon"]["obs"],
-        state_dim=config["state_dim"],
+        state_dim=len(robot_of(config).state),
         vision=_name(encoder.get("vision", encoder), VISION),
         vision_residual=encoder.get("vision", {}).get("residual", STANDARD),
         view_tokens=encoder.get("view_tokens", {}).get("tokens"),

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imfvla.episode import ACTION_NAMES
+from imfvla.robot import RobotSpec, bare_name
 
-GRIPPERS = tuple(index for index, name in enumerate(ACTION_NAMES) if name.endswith("/gripper"))
-LEFT, RIGHT = GRIPPERS  # 0 is closed, 1 open
-MIDDLE = 0.5
+MIDDLE = 0.5  # 0 is closed, 1 open
 CLOSED, OPEN = 0.2, 0.8  # between them a gripper is neither
 MOST_BETWEEN = 3  # control steps that a gripper may take from one to the other
 PROMPT = (3, 6)  # control steps from one hand's closing to the other one's opening in a hand-over
@@ -38,30 +36,39 @@ class Closings:
     pred: int
 
 
-def event_of(actions: np.ndarray) -> Event | None:
-    """The last closing of a gripper in the actions (T, A) of an episode; None where none closes."""
-    closed = actions[:, GRIPPERS] < MIDDLE
+def grippers_of(robot: RobotSpec) -> tuple[int, ...]:
+    """The channels of a robot's actions that open and close a gripper."""
+    names = (bare_name(channel).rpartition("/")[2] for channel in robot.action)
+    return tuple(index for index, name in enumerate(names) if name == "gripper")
+
+
+def event_of(actions: np.ndarray, grippers: Sequence[int]) -> Event | None:
+    """The last closing of one of the grippers in the actions (T, A) of an episode; None where none closes."""
+    closed = actions[:, list(grippers)] < MIDDLE
     steps, hands = np.nonzero(closed[1:] & ~closed[:-1])
     if not len(steps):
         return None
     step, hand = int(steps[-1]) + 1, int(hands[-1])
-    other = GRIPPERS[1 - hand]
-    after = actions[step : step + PROMPT[1] + 1, other] > MIDDLE
-    return Event(step, GRIPPERS[hand], other if not after[0] and after.any() else None)
+    opening = None
+    for other in (channel for number, channel in enumerate(grippers) if number != hand):
+        after = actions[step : step + PROMPT[1] + 1, other] > MIDDLE
+        if not after[0] and after.any():
+            opening = other
+    return Event(step, grippers[hand], opening)
 
 
-def release_delay(actions: np.ndarray) -> int | None:
-    """Steps from the left gripper's closing to the right one's opening in actions (T, A); None without either.
+def release_delay(actions: np.ndarray, taking: int, giving: int) -> int | None:
+    """Steps from the taking gripper's closing to the giving one's opening in actions (T, A); None without either.
 
-    Counted from the right one's first closing, since both begin open.
+    Counted from the giving one's first closing, since both begin open.
     """
     closed = actions < MIDDLE
-    held = np.flatnonzero(closed[:, RIGHT])
+    held = np.flatnonzero(closed[:, giving])
     if not len(held):
         return None
-    left = np.flatnonzero(closed[held[0] :, LEFT])
-    right = np.flatnonzero(~closed[held[0] :, RIGHT])
-    return int(right[0] - left[0]) if len(left) and len(right) else None
+    closes = np.flatnonzero(closed[held[0] :, taking])
+    opens = np.flatnonzero(~closed[held[0] :, giving])
+    return int(opens[0] - closes[0]) if len(closes) and len(opens) else None
 
 
 def closings(chunks: np.ndarray, events: Sequence[Event]) -> Closings:
@@ -97,9 +104,9 @@ def measure_closings(found: Closings, executed: int) -> dict[str, float | None]:
 
 def fates(found: Closings) -> dict[str, float]:
     """Share of samples of each of FATES; the first that holds of between, lets go, waits, holds on, closes."""
-    left = np.ones(found.closes.shape, bool)
+    rest = np.ones(found.closes.shape, bool)
     shares = dict.fromkeys(FATES, 0.0)
-    late = np.zeros_like(left)
+    late = np.zeros_like(rest)
     if found.lets_go is not None:
         late = (found.closes + PROMPT[1] < found.pred) & (found.lets_go > found.closes + PROMPT[1])
     for name, holds in (
@@ -107,10 +114,10 @@ def fates(found: Closings) -> dict[str, float]:
         ("lets go", _too_soon(found)),
         ("waits", found.closes == found.pred),
         ("holds on", late),
-        ("closes", left.copy()),
+        ("closes", rest.copy()),
     ):
-        shares[name] = float((left & holds).mean())
-        left &= ~holds
+        shares[name] = float((rest & holds).mean())
+        rest &= ~holds
     return shares
 
 

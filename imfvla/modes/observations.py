@@ -63,8 +63,10 @@ class Stops:
     closing; `events` are the closings that these precede.
     """
 
-    def __init__(self, horizon: Horizon, views: Sequence[str], num_episodes: int, most: int) -> None:
-        self._horizon, self._views, self._most = horizon, views, most
+    def __init__(
+        self, horizon: Horizon, views: Sequence[str], grippers: Sequence[int], num_episodes: int, most: int
+    ) -> None:
+        self._horizon, self._views, self._grippers, self._most = horizon, views, grippers, most
         self._pairs_each = -(-most // (2 * num_episodes))
         self.starts, self.before, self.after, self.waiting = (Observations() for _ in range(4))
         self.events: list[Event] = []
@@ -84,7 +86,7 @@ class Stops:
         )
         self._add(self.before, episode, pairs)
         self._add(self.after, episode, [step + self.gap for step in pairs])
-        event = event_of(episode.action)
+        event = event_of(episode.action, self._grippers)
         if event is not None:
             wait = episode.info.metadata.get("style", {}).get("wait") or self._horizon.pred
             steps = [step for step in usable if event.step - wait <= step < event.step]

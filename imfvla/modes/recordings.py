@@ -14,6 +14,7 @@ from imfvla.collection import (
     record_demonstration,
     recorded_seeds,
     recording_path,
+    sizes_of,
 )
 from imfvla.documents import read_json
 from imfvla.errors import UserError
@@ -101,7 +102,8 @@ def read_demonstration(path: Path, settings: Settings) -> Episode:
     if episode.info.kind != "demonstration":
         raise UserError(f"{path} must be a demonstration, found a {episode.info.kind}: correct --demos.")
     recorded = LATER_SETTINGS | dict(episode.info.config)
-    recorded |= {"task": episode.info.task, "image_size": list(episode.info.image_size)}
+    size = sizes_of(episode.info.robot)[0]  # of all, as of the run's: our own tasks have one size
+    recorded |= {"task": episode.info.task, "image_size": list(size)}
     for key in SHARED:
         wanted = getattr(settings, key)
         wanted = list(wanted) if isinstance(wanted, tuple) else wanted

@@ -11,7 +11,7 @@ import numpy as np
 from imfvla.modes import grippers, turns
 from imfvla.modes.observations import Observations, Stops
 from imfvla.modes.samples import draw_samples
-from imfvla.modes.spread import measure_jumps, measure_spread
+from imfvla.modes.spread import joints_of, measure_jumps, measure_spread
 from imfvla.policy import Policy
 from imfvla.reporting.table import Table, number
 
@@ -57,7 +57,7 @@ def measure(
     assert num >= 2, "one sample alone has no spread"
     for nfe in nfes:
         policy.generator.check_nfe(nfe)
-    wrists = turns.drawn_wrists(modes) if policy.horizon.pred >= turns.STEPS else ()
+    wrists = turns.drawn_wrists(modes, policy.robot) if policy.horizon.pred >= turns.STEPS else ()
     scale = policy.chunks.normaliser.scale.cpu().numpy()
     rows = {}
     for nfe in (None, *nfes):
@@ -79,7 +79,7 @@ def measure(
         if nfe is not None and len(stops.before):
             before, after = chunks(stops.before), chunks(stops.after)
             row |= measure_spread(before, np.stack(stops.before.actions), scale)
-            row |= measure_jumps(before, after, stops.gap, scale)
+            row |= measure_jumps(before, after, stops.gap, scale, joints_of(policy.robot))
         if nfe is not None:
             advance()
     places = {"waiting": len(stops.waiting), "starts": len(stops.starts), "decisions": len(stops.before)}

@@ -3,11 +3,16 @@
 Shapes: N observations, K samples of each, Tp predicted steps, A action.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from imfvla.episode import ACTION_NAMES
+from imfvla.robot import RobotSpec, unit_of
 
-JOINTS = [index for index, name in enumerate(ACTION_NAMES) if "/joint_" in name]
+
+def joints_of(robot: RobotSpec) -> list[int]:
+    """The channels of a robot's actions that are angles."""
+    return [index for index, channel in enumerate(robot.action) if unit_of(channel) == "rad"]
 
 
 def measure_spread(
@@ -28,18 +33,18 @@ def measure_spread(
 
 
 def measure_jumps(
-    chunks: np.ndarray, later: np.ndarray, executed: int, scale: np.ndarray
+    chunks: np.ndarray, later: np.ndarray, executed: int, scale: np.ndarray, joints: Sequence[int]
 ) -> dict[str, float | None]:
     """Root mean square difference over the steps that chunks (N, K, Tp, A) share with those of `executed` steps later.
 
-    `jump_rad` is over the joints, `jump` over all channels in units of `scale` (Tp, A), that of the earlier chunk. None
-    where no step is shared.
+    `jump_rad` is over the channels `joints`, `jump` over all in units of `scale` (Tp, A), that of the earlier chunk.
+    None where no step is shared, and where there are no such channels.
     """
     if executed >= chunks.shape[2]:
         return {"jump_rad": None, "jump": None}
     difference = later[:, :, :-executed] - chunks[:, :, executed:]
     return {
-        "jump_rad": _rms(difference[..., JOINTS]),
+        "jump_rad": _rms(difference[..., list(joints)]) if joints else None,
         "jump": _rms(difference / scale[executed:]),
     }
 

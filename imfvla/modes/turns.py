@@ -1,21 +1,22 @@
 """Which of a gripper's two equivalent yaws samples take, from how far the wrist has rolled within the chunk.
 
-Shapes: N observations, K samples of each, Tp predicted steps, S state, A action; A equals S, channel by channel.
+Shapes: N observations, K samples of each, Tp predicted steps, S state, A action.
 """
 
 import numpy as np
 
-from imfvla.episode import ACTION_NAMES
+from imfvla.robot import RobotSpec, bare_name
 
 # By `task.expert.modes`: the wrists whose way is drawn. Hands point down, so that a wrist's roll is the gripper's yaw.
-DRAWN_HANDS = {1: (), 2: ("right",), 4: ("left", "right")}
+DRAWN_WRISTS = {1: (), 2: ("right/joint_7",), 4: ("left/joint_7", "right/joint_7")}
 STEPS = 16  # the experts roll a wrist by some 0.9 rad in so many control steps, to one side or the other
 BRIDGE, ARRIVED = 0.25, 0.75  # rad
 
 
-def drawn_wrists(modes: int) -> tuple[int, ...]:
-    """Channels of the wrists whose way an expert of so many modes draws."""
-    return tuple(ACTION_NAMES.index(f"{hand}/joint_7") for hand in DRAWN_HANDS[modes])
+def drawn_wrists(modes: int, robot: RobotSpec) -> tuple[int, ...]:
+    """Channels, of actions and of the state alike, of the wrists whose way an expert of so many modes draws."""
+    names = [bare_name(channel) for channel in robot.action]
+    return tuple(names.index(wrist) for wrist in DRAWN_WRISTS[modes])
 
 
 def turns(chunks: np.ndarray, state: np.ndarray, wrists: tuple[int, ...]) -> np.ndarray:

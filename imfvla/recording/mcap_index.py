@@ -67,7 +67,7 @@ def _summarised(path: Path) -> EpisodeIndex | None:
         if opcode != Opcode.DATA_END or not data_crc:
             return None
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-    return _index(num_bytes, counts, data_crc, metadata)
+    return _index(path, num_bytes, counts, data_crc, metadata)
 
 
 def _counted(path: Path) -> EpisodeIndex:
@@ -83,16 +83,20 @@ def _counted(path: Path) -> EpisodeIndex:
             topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             metadata[record.name] = record.metadata
-    return _index(len(data), counts, zlib.crc32(data), metadata)
+    return _index(path, len(data), counts, zlib.crc32(data), metadata)
 
 
 def _index(
-    num_bytes: int, counts: Mapping[str, int], data_crc: int, metadata: Mapping[str, dict[str, str]]
+    path: Path,
+    num_bytes: int,
+    counts: Mapping[str, int],
+    data_crc: int,
+    metadata: Mapping[str, dict[str, str]],
 ) -> EpisodeIndex:
     for name in messages.RECORDS:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
     cameras = {topic: count for topic, count in counts.items() if topic.startswith(messages.CAMERA)}
     frames = {topic.removeprefix(messages.CAMERA): count for topic, count in cameras.items()}
-    info = messages.read_info(metadata[messages.EPISODE_RECORD], {})
+    info = messages.read_info(metadata[messages.EPISODE_RECORD], {}, path)
     return EpisodeIndex(num_bytes, counts.get(messages.STATE, 0), frames, data_crc, info)

@@ -1,6 +1,6 @@
-"""Reads recorded episodes back, and refuses those that are not whole."""
+"""Reads recorded episodes back, and refuses those that are not whole or do not fit their robot."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,33 +13,36 @@ from imfvla.documents import parse_json
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.recording import messages
+from imfvla.recording.channels import Channels, Misfit
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES, clear_read_errors, records
-from imfvla.recording.pictures import decode
+from imfvla.recording.pictures import decode, size_of
+from imfvla.robot import Camera
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """A recorded episode. T control steps, K steps with frames."""
+    """A recorded episode. T control steps, K steps with frames, S state, A action, of `info.robot`."""
 
     path: Path
     info: EpisodeInfo
     result: EpisodeResult
     time_s: np.ndarray  # float64 (T,)  simulated, before the action
-    state: np.ndarray  # float32 (T, 16)  before the action
-    action: np.ndarray  # float32 (T, 16)  clean: what a policy should learn
-    executed: np.ndarray  # float32 (T, 16)
+    state: np.ndarray  # float32 (T, S)  before the action
+    action: np.ndarray  # float32 (T, A)  clean: what a policy should learn
+    executed: np.ndarray  # float32 (T, A)
     reward: np.ndarray  # float32 (T,)  after the action
     stage: np.ndarray  # int64 (T,)  after the action
-    chunks: Mapping[int, np.ndarray]  # step -> float32 (Tp, 16), where the policy replanned
+    chunks: Mapping[int, np.ndarray]  # step -> float32 (Tp, A), where the policy replanned
     image_steps: np.ndarray  # int64 (K,)  steps at which every recorded view has a frame
-    images: Mapping[str, np.ndarray]  # view -> uint8 (K, H, W, 3); empty if not requested
+    images: Mapping[str, np.ndarray]  # view -> uint8 (K, H, W, 3) of its camera; empty if not requested
 
 
 def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> Episode:
     """The whole episode at `path`, with every checksum verified.
 
     `images` says which views to decode: all, none, or those named. Raises UserError naming the file where
-    it is missing, truncated or corrupt, and where it lacks a requested view.
+    it is missing, truncated or corrupt, where it lacks a requested view, and where a message or a picture is not one of
+    the robot's.
     """
     path = Path(path)
     with clear_read_errors(path):
@@ -63,12 +66,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
     for name in messages.RECORDS:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
-    if (found := metadata[messages.EPISODE_RECORD]["format"]) != messages.FORMAT:
-        raise UserError(
-            f"{path} has recording format {found}, wanted {messages.FORMAT}: read it with the version of imfvla that "
-            "wrote it, or move it away and collect again."
-        )
-    info = messages.read_info(metadata[messages.EPISODE_RECORD], config)
+    info = messages.read_info(metadata[messages.EPISODE_RECORD], config, path)
     result = messages.read_result(metadata[messages.RESULT_RECORD])
 
     times = [time for time, _ in rows.get(messages.STATE, [])]
@@ -80,8 +78,12 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         raise ValueError(f"times of {messages.STATE} do not increase")
     step_at = {time: step for step, time in enumerate(times)}
 
-    states = [messages.from_arms(parse_json(text)) for _, text in rows.get(messages.STATE, [])]
-    actions = [parse_json(text) for _, text in rows.get(messages.ACTION, [])]
+    state, action = Channels(info.robot.state), Channels(info.robot.action)
+    states = _channels(path, messages.STATE, rows, state)
+    actions = {
+        part: _channels(path, messages.ACTION, rows, action, part)
+        for part in (messages.CLEAN, messages.EXECUTED)
+    }
     rewards = [parse_json(text) for _, text in rows.get(messages.REWARD, [])]
     chunks = [parse_json(text) for _, text in rows.get(messages.CHUNK, [])]
     frames = {
@@ -101,34 +103,72 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         info=info,
         result=result,
         time_s=(np.array(times, np.int64) - messages.EPOCH_NS) / 1e9,
-        state=_matrix(states),
-        action=_matrix([messages.from_arms(action["clean"]) for action in actions]),
-        executed=_matrix([messages.from_arms(action["executed"]) for action in actions]),
+        state=states,
+        action=actions[messages.CLEAN],
+        executed=actions[messages.EXECUTED],
         reward=np.array([reward["reward"] for reward in rewards], np.float32),
         stage=np.array([reward["stage"] for reward in rewards], np.int64),
-        chunks={chunk["step"]: _matrix(chunk["actions"]) for chunk in chunks},
+        chunks={chunk["step"]: _chunk(path, chunk, action) for chunk in chunks},
         image_steps=np.array(image_steps, np.int64),
         images={
-            view: np.stack(list(_decoded(frames[view][step] for step in image_steps)))
-            if image_steps
-            else np.zeros((0, *info.image_size, 3), np.uint8)
+            view: _pictures(path, info.robot.camera(view), [frames[view][step] for step in image_steps])
             for view in views
         },
     )
 
 
-def _decoded(encoded: Iterable[bytes]) -> Iterator[np.ndarray]:
-    total = 0
-    for message in encoded:
-        picture = decode(messages.camera_bytes(message))
-        total += picture.nbytes
-        if total > MAX_EPISODE_BYTES:
-            raise ValueError(f"pictures of more than {MAX_EPISODE_BYTES} bytes")
-        yield picture
+def _channels(
+    path: Path, topic: str, rows: Mapping[str, list[tuple[int, bytes]]], channels: Channels, part: str = ""
+) -> np.ndarray:
+    """The messages of a topic, or a part of each: float32 (T, channels)."""
+    found = []
+    for step, (_, text) in enumerate(rows.get(topic, [])):
+        message = parse_json(text)
+        try:
+            found.append(channels.values(message[part] if part else message))
+        except Misfit as error:
+            raise _misfit(path, f"{topic} {part}".strip(), step, error) from error
+    return _matrix(found, len(channels.names))
 
 
-def _matrix(rows: list) -> np.ndarray:
-    """float32 (len(rows), 16); None becomes NaN."""
+def _chunk(path: Path, chunk: Mapping[str, Any], channels: Channels) -> np.ndarray:
+    """float32 (Tp, A)."""
+    actions = chunk["actions"]
+    if any(len(action) != len(channels.names) for action in actions):
+        problem = Misfit("each action", f"{len(channels.names)} numbers", f"{[len(a) for a in actions][:5]}")
+        raise _misfit(path, messages.CHUNK, chunk["step"], problem)
+    return _matrix(actions, len(channels.names))
+
+
+def _pictures(path: Path, camera: Camera, encoded: list[bytes]) -> np.ndarray:
+    """uint8 (K, H, W, 3)."""
+    pictures = np.empty((len(encoded), camera.height, camera.width, 3), np.uint8)
+    if pictures.nbytes > MAX_EPISODE_BYTES:
+        raise ValueError(f"pictures of more than {MAX_EPISODE_BYTES} bytes")
+    for picture, message in zip(pictures, encoded, strict=True):
+        data = messages.camera_bytes(message)
+        if (found := size_of(data)) != (camera.height, camera.width):
+            wanted = f"{camera.height} x {camera.width} pixels, as its robot's camera"
+            raise _misfit(
+                path,
+                messages.CAMERA + camera.name,
+                None,
+                Misfit("each picture", wanted, f"{found[0]} x {found[1]}"),
+            )
+        picture[...] = decode(data)
+    return pictures
+
+
+def _misfit(path: Path, topic: str, step: int | None, problem: Misfit) -> UserError:
+    where = topic if step is None else f"{topic} of step {step}"
+    return UserError(
+        f"{path} does not fit the robot that it states: {where}: {problem}. Record or convert it again with that "
+        "robot, or move it away."
+    )
+
+
+def _matrix(rows: list, width: int) -> np.ndarray:
+    """float32 (len(rows), width); None becomes NaN."""
     with np.errstate(over="ignore"):  # what is too large for a float32 is infinite
         numbers = np.array(rows, np.float64).astype(np.float32)
-    return numbers.reshape(len(rows), len(messages.ACTION_NAMES))
+    return numbers.reshape(len(rows), width)

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from imfvla.environment import Environment, bodies_of
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.files import write_remedy
 from imfvla.recording import messages, schemas
+from imfvla.recording.channels import Channels, numbers
 from imfvla.recording.pictures import encode
 from imfvla.recording.scene import at_time, body_names, frame_transforms, scene_update
 
-TRANSFORMS_EVERY = 5  # steps between two /tf messages: 10 Hz
+TRANSFORMS_HZ = 10  # of /tf messages, at most
 INFO, WARNING = 2, 3  # levels of foxglove.Log
 
 
@@ -26,7 +28,7 @@ class McapSink:
     it that have no frames get those of `env.look()`. They are PNG if `lossless`, as training needs
     them, else JPEG. `begin` expects `env` after its reset and `step` after the action, so the
     frames and body poses that the simulator shows then belong to the next step and are kept until it
-    comes.
+    comes. An environment without `scene` has no /tf and no /scene.
 
     The file is written beside `path` under a hidden name and renamed by `end`; `abort`, and any error while
     writing, removes it and leaves an earlier file at `path` unchanged. Raises UserError naming `path` where it cannot
@@ -42,7 +44,7 @@ class McapSink:
         self._render_every = render_every
         self._stream = None
 
-    def begin(self, env: Any, info: EpisodeInfo) -> None:
+    def begin(self, env: Environment, info: EpisodeInfo) -> None:
         with self._cleaning_up():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = open(self._part, "wb")  # noqa: SIM115  closed by end or abort
@@ -61,14 +63,24 @@ class McapSink:
                 "application/json",
                 messages.dump(info.config),
             )
-            self._bodies = body_names(env.physics.model)
-            self._scene = scene_update(env.physics.model)
+            self._state, self._action = Channels(info.robot.state), Channels(info.robot.action)
+            self._state_schema = self._state.schema("imfvla.RobotState")
+            self._action_schema = schemas.object_of(
+                "imfvla.RobotAction",
+                clean=self._action.schema("imfvla.CleanAction"),
+                executed=self._action.schema("imfvla.ExecutedAction"),
+            )
+            self._sizes = {camera.name: (camera.height, camera.width) for camera in info.robot.cameras}
+            self._transforms_every = max(1, round(info.robot.control_hz / TRANSFORMS_HZ))
+            bodies = bodies_of(env)
+            self._bodies = [] if bodies is None else body_names(bodies.model)
+            self._scene = None if bodies is None else scene_update(bodies.model)
             self._see(env, 0)
 
-    def step(self, env: Any, step: Step) -> None:
+    def step(self, env: Environment, step: Step) -> None:
         with self._cleaning_up():
             self._time = messages.time_ns(step.time_s)
-            if self._num_steps == 0:
+            if self._num_steps == 0 and self._scene is not None:
                 self._write(messages.SCENE, schemas.SCENE_UPDATE, at_time(self._scene, self._time))
             if self._transforms is not None:
                 self._write(
@@ -76,7 +88,7 @@ class McapSink:
                 )
             images = step.decision.images
             self._write_images(self._frames if images is None else images)
-            self._write(messages.STATE, schemas.ROBOT_STATE, messages.by_arm(step.state))
+            self._write(messages.STATE, self._state_schema, self._state.tree(step.state))
             self._write_decision(step)
             reward = {"reward": float(step.reward), "stage": int(step.stage)}
             self._write(messages.REWARD, schemas.REWARD, reward)
@@ -106,30 +118,35 @@ class McapSink:
             self._stream = None
             self._part.unlink(missing_ok=True)
 
-    def _see(self, env: Any, next_step: int) -> None:
+    def _see(self, env: Environment, next_step: int) -> None:
         """Keeps the current frames and poses for the next step, if that step is recorded."""
-        moved, physics = next_step % TRANSFORMS_EVERY == 0, env.physics
-        self._transforms = frame_transforms(self._bodies, physics.data) if moved else None
+        bodies = bodies_of(env) if next_step % self._transforms_every == 0 else None
+        self._transforms = None if bodies is None else frame_transforms(self._bodies, bodies.data)
         self._frames = env.look() if self._render_every and next_step % self._render_every == 0 else {}
 
     def _write_images(self, images: Mapping[str, np.ndarray]) -> None:
         for view, frame in images.items():
             encoded, image_format = encode(np.ascontiguousarray(frame), lossless=self._lossless)
+            if frame.shape[:2] != self._sizes[view]:
+                raise UserError(
+                    f"Camera {view} must show {_size(self._sizes[view])} pixels, as the robot says, found "
+                    f"{_size(frame.shape[:2])}: correct the environment."
+                )
             message = messages.camera_message(self._time, view, encoded, image_format)
             self._write(messages.CAMERA + view, schemas.COMPRESSED_IMAGE, message)
 
     def _write_decision(self, step: Step) -> None:
         decision = step.decision
         action = {
-            "clean": messages.by_arm(decision.action),
-            "executed": messages.by_arm(decision.executed),
+            messages.CLEAN: self._action.tree(decision.action),
+            messages.EXECUTED: self._action.tree(decision.executed),
         }
-        self._write(messages.ACTION, schemas.ROBOT_ACTION, action)
+        self._write(messages.ACTION, self._action_schema, action)
         if decision.chunk is not None:
             chunk = {
                 "step": step.index,
-                "names": messages.ACTION_NAMES,
-                "actions": messages.numbers(decision.chunk),
+                "names": self._action.names,
+                "actions": numbers(decision.chunk),
             }
             self._write(messages.CHUNK, schemas.ACTION_CHUNK, chunk)
         if decision.inference_ms is not None:
@@ -162,3 +179,7 @@ class McapSink:
         except BaseException:
             self.abort()
             raise
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} x {shape[1]}"

@@ -9,15 +9,20 @@ import base64
 import json
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from imfvla.documents import parse_json
-from imfvla.episode import ACTION_NAMES, EpisodeInfo, EpisodeResult
+from imfvla.episode import EpisodeInfo, EpisodeResult
+from imfvla.errors import UserError
+from imfvla.robot import RobotSpec
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
-FORMAT = "1"
+FORMAT = "2"  # "1" had no robot, which was that of this package's own tasks
+READABLE = ("1", FORMAT)
 EPOCH_NS = 1_767_225_600 * 10**9  # 2026-01-01T00:00:00Z
 EPISODE_RECORD = "imfvla.episode"  # metadata: EpisodeInfo, written first
 RESULT_RECORD = "imfvla.result"  # metadata: EpisodeResult, written last: a file without it is incomplete
@@ -27,6 +32,7 @@ CONFIG_ATTACHMENT = "config.json"
 CAMERA = "/camera/"
 STATE = "/robot/state"
 ACTION = "/robot/action"
+CLEAN, EXECUTED = "clean", "executed"  # parts of an action's message
 CHUNK = "/policy/chunk"
 INFERENCE = "/policy/inference_ms"
 REWARD = "/episode/reward"
@@ -35,7 +41,6 @@ TRANSFORMS = "/tf"
 SCENE = "/scene"
 
 T = TypeVar("T")
-_ARM_AND_JOINT = tuple(tuple(name.split("/")) for name in ACTION_NAMES)
 
 
 def time_ns(time_s: float) -> int:
@@ -61,25 +66,6 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be recorded as JSON: {value!r}")
 
 
-def numbers(values: np.ndarray) -> list:
-    """Nested lists of an array's numbers, None where one is not finite."""
-    values = np.asarray(values)
-    return (values if np.isfinite(values).all() else np.where(np.isfinite(values), values, None)).tolist()
-
-
-def by_arm(values: np.ndarray) -> dict[str, dict[str, float | None]]:
-    """(16,) in the order of ACTION_NAMES, as {"left": {"joint_1": ...}, "right": ...}."""
-    arms: dict[str, dict[str, float | None]] = {}
-    for (arm, joint), value in zip(_ARM_AND_JOINT, numbers(values), strict=True):
-        arms.setdefault(arm, {})[joint] = value
-    return arms
-
-
-def from_arms(arms: dict[str, dict[str, float | None]]) -> list[float | None]:
-    """Inverse of `by_arm`."""
-    return [arms[arm][joint] for arm, joint in _ARM_AND_JOINT]
-
-
 def camera_message(log_time_ns: int, view: str, encoded: bytes, image_format: str) -> bytes:
     """foxglove.CompressedImage."""
     data = base64.b64encode(encoded).decode("ascii")
@@ -93,15 +79,34 @@ def camera_bytes(message: bytes) -> bytes:
 
 def info_record(info: EpisodeInfo) -> dict[str, str]:
     """Metadata record of an episode's beginning: JSON texts by field; the config travels as attachment."""
-    names = (field.name for field in fields(info) if field.name != "config")
-    return {"format": FORMAT} | {name: dump(getattr(info, name)).decode() for name in names}
+    values = {field.name: getattr(info, field.name) for field in fields(info) if field.name != "config"}
+    values["robot"] = info.robot.to_json()
+    return {"format": FORMAT} | {name: dump(value).decode() for name, value in values.items()}
 
 
-def read_info(record: dict[str, str], config: dict[str, Any]) -> EpisodeInfo:
-    """Inverse of `info_record`."""
+def read_info(record: dict[str, str], config: dict[str, Any], path: Path) -> EpisodeInfo:
+    """Inverse of `info_record`.
+
+    Raises UserError naming `path` where it is of another format, and the key where its robot contradicts itself.
+    """
+    if (found := record["format"]) not in READABLE:
+        raise UserError(
+            f"{path} has recording format {found}, wanted {' or '.join(READABLE)}: read it with the version of imfvla "
+            "that wrote it, or move it away and collect again."
+        )
     values = {name: parse_json(text) for name, text in record.items() if name != "format"}
-    values |= {"views": tuple(values["views"]), "image_size": tuple(values["image_size"])}
+    values["views"] = tuple(values["views"])
+    values["robot"] = _robot(values, path)
     return _checked(EpisodeInfo, values | {"config": config})
+
+
+def _robot(values: dict[str, Any], path: Path) -> RobotSpec:
+    """The robot of a recording. The one place that knows what those from before it was recorded are of."""
+    image_size = values.pop("image_size", None)
+    if "robot" in values:
+        return RobotSpec.from_json(values["robot"], f"{path}: robot")
+    height, width = image_size
+    return bimanual_robot(values["views"], (height, width))
 
 
 def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:

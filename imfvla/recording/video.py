@@ -4,17 +4,18 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
 import numpy as np
 
-from imfvla.episode import CONTROL_HZ, EpisodeInfo, EpisodeResult, Step
+from imfvla.environment import Environment
+from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.files import write_remedy
 
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
+FRAMES_HZ = 25  # of videos of faster robots, nearly
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 CAPTION_HEIGHT, CAPTION_MARGIN = 28, 6  # [px]
 MIN_WIDTH = 480  # [px] of a row: the least that holds a legible caption
@@ -93,9 +94,26 @@ def write_mp4(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Non
     writer.close()
 
 
+def steps_between_frames(control_hz: float) -> int:
+    """Control steps from one frame of a video to the next, so that it has some FRAMES_HZ and shows whole steps."""
+    return max(1, round(control_hz / FRAMES_HZ))
+
+
+def status_line(time_s: float, stage: int | None, total: float) -> str:
+    """What a caption says of a step; `stage` is None where the task has none."""
+    middle = "" if stage is None else f"  stage {stage}"
+    return f"{time_s:5.2f} s{middle}  return {total:.4g}"
+
+
 def side_by_side(pictures: Sequence[np.ndarray], caption: str) -> np.ndarray:
-    """Pictures uint8 (H, W, 3) in a row above a fitted line of text; small ones are enlarged by a whole factor."""
-    row = np.concatenate(pictures, axis=1)
+    """Pictures uint8 (H, W, 3) in a row above a fitted line of text; small ones are enlarged by a whole factor.
+
+    Pictures lower than the highest stand on black.
+    """
+    height = max(picture.shape[0] for picture in pictures)
+    row = np.concatenate(
+        [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures], axis=1
+    )
     factor = -(-MIN_WIDTH // row.shape[1])
     row = row.repeat(factor, axis=0).repeat(factor, axis=1)
     line = np.zeros((CAPTION_HEIGHT, row.shape[1], 3), np.uint8)
@@ -108,32 +126,34 @@ def side_by_side(pictures: Sequence[np.ndarray], caption: str) -> np.ndarray:
 
 
 class VideoSink:
-    """An `episode.Sink` that films every `every`-th control step of an episode in real time.
+    """An `episode.Sink` that films an episode in real time, at some `FRAMES_HZ` where control is faster.
 
-    Renders `views` at `size` (H, W) [px] through `env.render`, after the action, with the stage and the
-    return so far. Errors and `abort` leave nothing behind.
+    Renders `views` at `height` [px], in the proportions of their cameras, through `env.render`, after the action, with
+    the stage, where the task has stages, and the return so far. Errors and `abort` leave nothing behind.
     """
 
-    def __init__(
-        self, path: str | Path, *, views: Sequence[str], size: tuple[int, int], every: int = 2
-    ) -> None:
-        if not views or every < 1:
-            raise ValueError(f"Wanted at least one view and every >= 1, found {views!r} and {every}.")
+    def __init__(self, path: str | Path, *, views: Sequence[str], height: int) -> None:
+        if not views:
+            raise ValueError("Wanted at least one view, found none.")
         self.path = Path(path)
-        self._views, self._size, self._every = tuple(views), tuple(size), every
+        self._views, self._height = tuple(views), height
         self._writer: Mp4Writer | None = None
 
-    def begin(self, env: Any, info: EpisodeInfo) -> None:
-        self._writer = Mp4Writer(self.path, CONTROL_HZ / self._every)
+    def begin(self, env: Environment, info: EpisodeInfo) -> None:
+        every = self._every = steps_between_frames(info.robot.control_hz)
+        self._writer = Mp4Writer(self.path, info.robot.control_hz / every)
+        cameras = map(info.robot.camera, self._views)
+        self._sizes = {c.name: (self._height, round(self._height * c.width / c.height)) for c in cameras}
         self._return = 0.0
         method = f"infer{info.metadata['nfe']}" if "nfe" in info.metadata else info.kind
         self._title = f"{info.task}  seed {info.seed}  {method}"
 
-    def step(self, env: Any, step: Step) -> None:
+    def step(self, env: Environment, step: Step) -> None:
         self._return += step.reward
         if step.index % self._every == 0:
-            status = f"{step.time_s:5.2f} s  stage {step.stage}  return {self._return:.0f}"
-            pictures = [env.render(view, *self._size) for view in self._views]
+            stage = step.stage if env.stages else None
+            status = status_line(step.time_s, stage, self._return)
+            pictures = [env.render(view, *size) for view, size in self._sizes.items()]
             self._writer.add(side_by_side(pictures, f"{self._title}  {status}"))
 
     def end(self, result: EpisodeResult) -> None:

@@ -4,25 +4,23 @@ import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass
 
-import dm_env
 import numpy as np
 from dm_control import composer, mjcf
 from dm_control.composer.observation import observable
 from dm_control.mujoco import engine
 from dm_env import specs
 
-from imfvla.episode import ACTION_DIM, ACTION_NAMES, CONTROL_HZ, STATE_DIM
+from imfvla.environment import Outcome
 from imfvla.errors import UserError
 from imfvla.options import build
+from imfvla.tasks.bimanual_robot import ALL_VIEWS, CONTROL_HZ, SIDES, TIME_LIMIT_STEPS, bimanual_robot
+from imfvla.tasks.catalogue import entry_of, text_for
 from imfvla.tasks.props import Prop
 from imfvla.tasks.robot import FINGER_TRAVEL, home_joints
 from imfvla.tasks.scene import CAMERAS, PHYSICS_TIMESTEP_S, Scene
-from imfvla.tasks.texts import text_for
 from imfvla.views import ViewOptions
 
-TIME_LIMIT_STEPS = 700
 START_OPENING = 0.8
-SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ class Pose:
 class _Ids:
     """Indices into the compiled model, looked up once."""
 
-    qpos: np.ndarray  # (16,) of the joints in the order of ACTION_NAMES; a gripper's first finger
+    qpos: np.ndarray  # (16,) of the joints in the order of the robot's channels; a gripper's first finger
     start: np.ndarray  # (18,) of all arm and finger joints, arms in the order of SIDES
     grip: dict[str, int]  # side -> site
     fingers: dict[str, tuple[frozenset[int], ...]]  # side -> geoms of each finger
@@ -66,12 +64,12 @@ class _Ids:
 class BimanualTask(composer.Task):
     """Two arms, one table and some props. Subclasses place the props and say which stage holds.
 
-    Attributes for subclasses to set: `name`, `num_stages`, `ranges` (prop name -> StartRange). `goal` is the task whose
-    stages count and whose instruction is given: the task itself, except in a scene that serves several tasks.
+    Attributes for subclasses to set: `name`, an entry of `catalogue.TASKS`, and `ranges` (prop name -> StartRange).
+    `goal` is the task whose stages count and whose instruction is given: the task itself, except in a scene that serves
+    several tasks.
     """
 
     name: str
-    num_stages: int
     ranges: dict[str, StartRange]
 
     def __init__(self, variant: str, props: dict[str, Prop]) -> None:
@@ -97,6 +95,11 @@ class BimanualTask(composer.Task):
     @property
     def goal(self) -> str:
         return self.name
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages, in order."""
+        return entry_of(self.goal).stages
 
     def begin(self, seed: int) -> np.random.RandomState:
         """What the start state of the episode `seed` is drawn from."""
@@ -146,11 +149,9 @@ class BimanualTask(composer.Task):
             )
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
-        """Joint targets [rad] and gripper openings [0, 1] in the order of ACTION_NAMES."""
+        """Joint targets [rad] and gripper openings [0, 1] in the order of the actuators, which is the robot's."""
         limits = np.asarray(physics.model.actuator_ctrlrange, dtype=np.float32)
-        return specs.BoundedArray(
-            (ACTION_DIM,), np.float32, limits[:, 0], limits[:, 1], name="\t".join(ACTION_NAMES)
-        )
+        return specs.BoundedArray((len(limits),), np.float32, limits[:, 0], limits[:, 1])
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         return float(self.stage(physics))
@@ -159,7 +160,6 @@ class BimanualTask(composer.Task):
         """float32 (16,): per arm 7 joint angles [rad] and the measured gripper opening [0, 1]."""
         state = np.asarray(physics.data.qpos[self._ids.qpos], dtype=np.float32)
         state[7::8] = np.clip(state[7::8] / FINGER_TRAVEL, 0, 1)
-        assert state.shape == (STATE_DIM,)
         return state
 
     def stage(self, physics: mjcf.Physics) -> int:
@@ -201,26 +201,26 @@ class BimanualTask(composer.Task):
         return set(contacts[mine[:, ::-1]].tolist())
 
 
-class BimanualEnvironment(composer.Environment):
-    """A task as a `dm_env.Environment` at 50 Hz whose cameras are rendered only when someone looks.
+class BimanualEnvironment:
+    """An `environment.Environment` of one task, whose cameras are rendered only when someone looks.
 
-    Actions are float32 (16,): joint targets [rad] and gripper openings [0, 1] in the order of ACTION_NAMES.
-    The reward is the highest stage that holds after the step; the last step is number 700.
+    Actions are joint targets [rad] and gripper openings [0, 1] in the order of `robot.action`. The reward is the
+    highest stage that holds after the step. An episode in which the last stage held at any step is a success, unless
+    its simulation diverges, which ends it.
     """
 
     time_limit_steps = TIME_LIMIT_STEPS
-    all_views = tuple(CAMERAS)
+    all_views = ALL_VIEWS
 
-    def __init__(
-        self, task: BimanualTask, *, seed: int | None, image_size: tuple[int, int], views: tuple[str, ...]
-    ) -> None:
-        _check_views(views)
+    def __init__(self, task: BimanualTask, *, image_size: tuple[int, int], views: tuple[str, ...]) -> None:
         seen = build(ViewOptions, {"views": views, "image_size": image_size}, "observation")
+        self.robot = bimanual_robot(seen.views, seen.image_size)
         self.views, self.image_size = seen.views, seen.image_size
-        self._seeds = np.random.RandomState(seed)
+        self.task = task
         self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
         self._start_digest = ""
-        super().__init__(
+        self._num_steps = self._highest = 0
+        self._world = composer.Environment(
             task=task,
             time_limit=(TIME_LIMIT_STEPS - 0.1) / CONTROL_HZ,  # a margin for the sum of 3500 time steps
             random_state=0,
@@ -229,7 +229,13 @@ class BimanualEnvironment(composer.Environment):
             raise_exception_on_physics_error=False,
             strip_singleton_obs_buffer_dim=True,
         )
-        self._mjcf_never_compiled = False  # the constructor has compiled it; episodes do not change the model
+        self._world._mjcf_never_compiled = (
+            False  # the constructor has compiled it; episodes do not change the model
+        )
+
+    @property
+    def physics(self) -> mjcf.Physics:
+        return self._world.physics
 
     @property
     def name(self) -> str:
@@ -245,13 +251,9 @@ class BimanualEnvironment(composer.Environment):
         return None if self.task.goal == self.name else self.task.goal
 
     @property
-    def num_stages(self) -> int:
-        return self.task.num_stages
-
-    @property
-    def success_stage(self) -> int:
-        """A maximum reward of at least this counts as a success."""
-        return self.task.num_stages
+    def stages(self) -> tuple[str, ...]:
+        """Of the current episode's task."""
+        return self.task.stages
 
     @property
     def instruction(self) -> str:
@@ -262,28 +264,34 @@ class BimanualEnvironment(composer.Environment):
     def paraphrases(self) -> tuple[str, ...]:
         return text_for(self.task.goal)[1]
 
-    def reset(self, seed: int | None = None) -> dm_env.TimeStep:
-        """Starts an episode from the state that `seed` determines. Without one, draws a seed from the constructor's."""
-        if seed is None:
-            seed = int(self._seeds.randint(2**31))
-        self._random_state = self.task.begin(seed)
-        timestep = super().reset()
+    def reset(self, seed: int) -> None:
+        """Starts an episode from the state that `seed` determines."""
+        self._world.random_state.set_state(self.task.begin(seed).get_state())
+        self._world.reset()
+        self._num_steps = self._highest = 0
         start = np.round(np.asarray(self.physics.data.qpos), 9) + 0.0
         self._start_digest = hashlib.sha256(start.tobytes()).hexdigest()[:16]
-        return timestep
 
-    def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Applies one action (16,) for 20 ms. UserError unless it is 16 finite numbers."""
+    def step(self, action: np.ndarray) -> Outcome:
+        """Applies one action (A,) for one control step. UserError unless it is so many finite numbers."""
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+        channels = self.robot.action
+        if action.shape != (len(channels),) or not np.isfinite(action).all():
             raise UserError(
-                f"An action must be {ACTION_DIM} finite numbers ({', '.join(ACTION_NAMES[:2])}, ...), "
+                f"An action must be {len(channels)} finite numbers ({', '.join(channels[:2])}, ...), "
                 f"found shape {action.shape}: {action}; check the policy or script that chose it."
             )
-        return super().step(action)
+        timestep = self._world.step(action)
+        stage = int(timestep.reward)
+        self._num_steps += 1
+        self._highest = max(self._highest, stage)
+        ended = timestep.last()
+        diverged = ended and self._num_steps < TIME_LIMIT_STEPS
+        success = self._highest >= len(self.stages) and not diverged
+        return Outcome(float(stage), stage, success, ended)
 
     def state(self) -> np.ndarray:
-        """float32 (16,): per arm 7 joint angles [rad] and the measured gripper opening [0, 1]."""
+        """float32 (S,): per arm 7 joint angles [rad] and the measured gripper opening [0, 1]."""
         return self.task.state(self.physics)
 
     def stage(self) -> int:
@@ -298,26 +306,31 @@ class BimanualEnvironment(composer.Environment):
         """16 hex digits that name the simulated world: equal digests, equal physics and pictures."""
         return hashlib.sha256(self.task.root_entity.mjcf_model.to_xml_string().encode()).hexdigest()[:16]
 
-    def look(self, views: tuple[str, ...] | None = None) -> dict[str, np.ndarray]:
-        """Pictures uint8 (H, W, 3) of the named views, by default of the configured ones."""
-        return {view: self.render(view, *self.image_size) for view in (views or self.views)}
+    def look(self) -> dict[str, np.ndarray]:
+        """Pictures uint8 (H, W, 3) of the configured views."""
+        return {view: self.render(view, *self.image_size) for view in self.views}
 
     def render(self, view: str, height: int, width: int) -> np.ndarray:
-        """One view at any size: uint8 (height, width, 3)."""
-        _check_views((view,))
+        """One of `all_views` at any size: uint8 (height, width, 3)."""
         key = (view, height, width)
         if key not in self._cameras:
-            self._cameras[key] = engine.Camera(self._physics, height, width, CAMERAS[view])
+            bimanual_robot((view,), (height, width))  # refuses a view that there is not
+            self._cameras[key] = engine.Camera(self.physics, height, width, CAMERAS[view])
         return self._cameras[key].render().copy()
+
+    def scene(self) -> mjcf.Physics:
+        """The simulator's bodies, see `environment.Bodies`."""
+        return self.physics
+
+    def renderer(self) -> str:
+        from OpenGL import GL  # here, since the platform is chosen when the environment is built
+
+        def ask() -> str:
+            return GL.glGetString(GL.GL_RENDERER).decode()
+
+        with self.physics.contexts.gl.make_current() as context:
+            return context.call(ask)
 
     def close(self) -> None:
         self._cameras.clear()
-        super().close()
-
-
-def _check_views(views: tuple[str, ...]) -> None:
-    for view in views:
-        if view not in CAMERAS:
-            raise UserError(
-                f"There is no view {view!r}; choose from {', '.join(CAMERAS)} in observation.views."
-            )
+        self._world.close()

@@ -11,7 +11,7 @@ from imfvla.tasks.props import GREEN, Bar, Socket
 from imfvla.tasks.socket import APERTURE, PEG_LENGTH, RANGES, insertion_stage
 from imfvla.tasks.transfer import BAR_LENGTH, transfer_stage
 
-STAGES = {"socket": (5, insertion_stage), "transfer": (4, transfer_stage)}
+STAGES = {"socket": insertion_stage, "transfer": transfer_stage}
 GOALS = tuple(STAGES)
 # peg and bar lie one behind the other, far enough apart for a gripper; which is behind is drawn
 LANE_RANGES = {
@@ -41,10 +41,6 @@ class CombinedTask(BimanualTask):
     def goal(self) -> str:
         return self._goal
 
-    @property
-    def num_stages(self) -> int:
-        return STAGES[self.goal][0]
-
     def begin(self, seed: int) -> np.random.RandomState:
         self._goal = GOALS[seed % 2]
         return np.random.RandomState(seed // 2)
@@ -58,4 +54,4 @@ class CombinedTask(BimanualTask):
         return starts
 
     def stage(self, physics: mjcf.Physics) -> int:
-        return STAGES[self.goal][1](self, physics)
+        return STAGES[self.goal](self, physics)

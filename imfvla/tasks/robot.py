@@ -9,6 +9,8 @@ import math
 import numpy as np
 from dm_control import composer, mjcf
 
+from imfvla.tasks.bimanual_robot import JOINT_LIMITS
+
 SHOULDER_HEIGHT = 0.18
 UPPER_ARM = 0.34
 FOREARM = 0.34
@@ -16,7 +18,6 @@ HAND = 0.20  # wrist centre to the point between the fingertips
 FINGER_TRAVEL = 0.045  # of each finger; the opening is twice that
 FINGER_LENGTH = 0.08
 FINGERTIP = 0.006  # how far the fingers reach beyond the grip point
-JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9), (-2.2, 2.2), (-3.05, 3.05))
 # Motors have a large armature for their damping on purpose: the contact solver knows inertia but not damping. Where
 # damping times the time step exceeds the inertia, its forces are wrong and held objects jump.
 STIFFNESS = (2500.0, 2500.0, 1500.0, 1500.0, 400.0, 400.0, 200.0)  # [N m / rad]

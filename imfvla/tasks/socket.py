@@ -44,7 +44,6 @@ class SocketTask(BimanualTask):
     """Stages: 1 each arm holds its object, 2 both lifted, 3 tip at the mouth, 4 tip inside and aligned, 5 seated."""
 
     name = "socket"
-    num_stages = 5
 
     def __init__(self, variant: str) -> None:
         super().__init__(

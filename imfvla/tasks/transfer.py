@@ -18,7 +18,6 @@ class TransferTask(BimanualTask):
     """Stages: 1 right gripper holds the bar, 2 lifted, 3 left one holds it too, 4 left one alone, in the air."""
 
     name = "transfer"
-    num_stages = 4
 
     def __init__(self, variant: str) -> None:
         super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH)})

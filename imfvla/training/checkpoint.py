@@ -20,11 +20,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from imfvla.documents import parse_json
+from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError
 from imfvla.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.policy import Policy, build_policy
+from imfvla.robot import RobotSpec
+from imfvla.robot_of import KEY
 from imfvla.run_directory import RunDirectory
+from imfvla.same_robot import refuse_other_robot
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"
@@ -137,11 +140,30 @@ def load_weights(policy: nn.Module, path: Path) -> None:
 
 
 def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
-    """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients."""
+    """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients.
+
+    Raises UserError where the weights do not fit the run's config, or were trained for another robot.
+    """
     path = run.policy_weights(step)
     policy = build_policy(run.config(), statistics=None)
+    _refuse_other_robot(policy, path)
     load_weights(policy, path)
     return policy.eval().requires_grad_(False)
+
+
+def _refuse_other_robot(policy: Policy, path: Path) -> None:
+    """Raises UserError where the description beside the weights states another robot than the policy's."""
+    beside = path.with_suffix(".json")
+    stated = read_json(beside, "restore it", mapping=True).get(KEY) if beside.exists() else None
+    if stated is not None:  # else they are older than the key, and the config decides
+        refuse_other_robot(
+            RobotSpec.from_json(stated, f"{beside}: {KEY}"),
+            policy.robot,
+            policy.views,
+            of=f"the weights {path}",
+            where="The run's config.yaml",
+            remedy="Restore the config that the weights were trained with.",
+        )
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:

@@ -5,27 +5,69 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
+from imfvla.data.held_out import held_out
 from imfvla.horizon import Horizon
 from imfvla.options import build
 from imfvla.progress import Progress
-from imfvla.recording import Recordings
+from imfvla.robot_of import robot_of
+from imfvla.same_robot import refuse_other_data
+from imfvla.sources.base import EpisodeSource
+from imfvla.sources.mcap import McapSource
+from imfvla.sources.opening import kind_of
+
+STORES = Path("data/frames")  # of sources that are no folder of recordings
+DIGITS = 12  # of a source's digest in the name of its store
 
 
-def prepare_windows(config: Mapping[str, Any], demonstrations: Recordings) -> Windows:
-    """The training items of recordings, whose frame store is built if out of date.
+def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows:
+    """The training items of a source of episodes, whose frame store is built if out of date.
 
-    It is stored in `demos.frames_directory`, or beside the folder of the recordings where that is null.
+    Raises UserError where its robot is not the config's, where an episode is damaged, or where nothing can be written.
     """
+    robot = robot_of(config)
+    refuse_other_source(config, source)
     observation = config["observation"]
-    height, width = observation["image_size"]
-    directory = config["demos"]["frames_directory"] or demonstrations.directory.parent
-    store_path = Path(directory) / f"{demonstrations.name}_frames_{height}x{width}"
     with _DecodingProgress() as progress:
         store = FrameStore.build(
-            demonstrations, store_path, observation["image_size"], observation["views"], progress=progress
+            source,
+            store_path(config, source),
+            observation["image_size"],
+            observation["views"],
+            progress=progress,
         )
+    kept = held_out(config["task"], len(source))
     horizon = build(Horizon, config["horizon"], "horizon")
-    return Windows(store, horizon, paraphrases=config["task"]["paraphrases"])
+    trained = set(range(len(source))) - set(kept)
+    return Windows(store, horizon, robot, paraphrases=config["task"]["paraphrases"], episodes=trained)
+
+
+def held_out_windows(windows: Windows) -> Windows:
+    """The decisions of the episodes that training windows leave out, with the recorded sentences."""
+    others = set(range(len(windows.store.episodes))) - set(windows.chosen)
+    return Windows(windows.store, windows.horizon, windows.robot, paraphrases=False, episodes=others)
+
+
+def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> None:
+    """Raises UserError where the episodes are of another robot than the one that the config trains for."""
+    refuse_other_data(
+        robot_of(config),
+        source.robot,
+        config["observation"]["views"],
+        of="the task",
+        where=f"The data of demos.source={kind_of(config)}",
+        remedy="Choose data or a task of the same robot.",
+    )
+
+
+def store_path(config: Mapping[str, Any], source: EpisodeSource) -> Path:
+    """Where decoded frames lie: in `demos.frames_directory`, or beside a folder of recordings, or in `data/frames`."""
+    height, width = config["observation"]["image_size"]
+    chosen = config["demos"].get("frames_directory")
+    if isinstance(source, McapSource):
+        directory, name = source.recordings.directory.parent, source.recordings.name
+    else:
+        directory, name = STORES, f"{kind_of(config)}-{source.digest()[:DIGITS]}"
+    return Path(chosen or directory) / f"{name}_frames_{height}x{width}"
 
 
 def make_loader(config: Mapping[str, Any], windows: Windows) -> Loader:

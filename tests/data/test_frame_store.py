@@ -8,21 +8,22 @@ from synthetic import INSTRUCTION, PARAPHRASES, write_demonstrations, write_epis
 
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
-from imfvla.recording import Recordings, read_episode
+from imfvla.recording import read_episode
+from imfvla.sources.mcap import McapSource
 
 VIEWS = ("top", "front")
 
 
 @pytest.fixture
 def built(synthetic_demonstrations, tmp_path):
-    return FrameStore.build(Recordings.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
+    return FrameStore.build(McapSource.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
 
 
 def rebuilds(directory, path, size=(32, 32), views=VIEWS) -> int:
     """Number of episodes that a build decodes."""
     told = []
     FrameStore.build(
-        Recordings.of(directory), path, size, views, progress=lambda done, total: told.append((done, total))
+        McapSource.of(directory), path, size, views, progress=lambda done, total: told.append((done, total))
     )
     assert told == [(done, len(told)) for done in range(1, len(told) + 1)]
     return len(told)
@@ -32,7 +33,7 @@ def test_the_store_holds_what_was_recorded(built, synthetic_demonstrations):
     assert built.images.shape == (36, 2, 3, 32, 32)
     assert len(built.episodes) == 3
     for stored in built.episodes:
-        episode = read_episode(synthetic_demonstrations / stored.file)
+        episode = read_episode(synthetic_demonstrations / stored.name)
         rows = slice(stored.first_row, stored.first_row + stored.num_steps)
         np.testing.assert_array_equal(built.state[rows], episode.state)
         np.testing.assert_array_equal(built.action[rows], episode.action)
@@ -67,20 +68,22 @@ def test_a_store_is_rebuilt_when_anything_changed(synthetic_demonstrations, tmp_
 
 
 def test_frames_of_another_size_are_resampled(synthetic_demonstrations, built, tmp_path):
-    half = FrameStore.build(Recordings.of(synthetic_demonstrations), tmp_path / "half", (16, 16), VIEWS)
+    half = FrameStore.build(McapSource.of(synthetic_demonstrations), tmp_path / "half", (16, 16), VIEWS)
     blocks = built.images.reshape(36, 2, 3, 16, 2, 16, 2).astype(float).mean(axis=(4, 6))
     assert np.abs(half.images - blocks).max() <= 1
 
 
 def test_no_recordings_are_named(tmp_path):
     with pytest.raises(UserError, match=r"No recordings .*nowhere.*imfvla\.collect"):
-        FrameStore.build(Recordings.of(tmp_path / "nowhere"), tmp_path / "store", (32, 32), VIEWS)
+        FrameStore.build(McapSource.of(tmp_path / "nowhere"), tmp_path / "store", (32, 32), VIEWS)
 
 
 def test_a_missing_view_is_named(synthetic_demonstrations, tmp_path):
-    with pytest.raises(UserError, match=r"no frames of view side.*observation\.views"):
+    with pytest.raises(
+        UserError, match=r"no view 'side'.* cameras are front, top, r_wrist.*observation\.views"
+    ):
         FrameStore.build(
-            Recordings.of(synthetic_demonstrations), tmp_path / "store", (32, 32), ("front", "side")
+            McapSource.of(synthetic_demonstrations), tmp_path / "store", (32, 32), ("front", "side")
         )
     assert not (tmp_path / "store").exists()
 
@@ -94,7 +97,7 @@ def test_a_damaged_recording_is_named_and_the_store_stays(synthetic_demonstratio
     for damage in (whole[:-50], bytes(middle)):
         victim.write_bytes(damage)
         with pytest.raises(UserError, match=r"episode-00002\.mcap is (truncated|damaged)"):
-            FrameStore.build(Recordings.of(synthetic_demonstrations), built.path, (32, 32), ("front",))
+            FrameStore.build(McapSource.of(synthetic_demonstrations), built.path, (32, 32), ("front",))
     np.testing.assert_array_equal(FrameStore.open(built.path).images, images)
     assert not list(tmp_path.glob(".*.part"))
 
@@ -104,8 +107,11 @@ def test_an_action_that_is_not_finite_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("synthetic.synthetic_actions", lambda seed, num_steps: actions)
     monkeypatch.setattr("synthetic.StillScene.look", lambda self: {"top": np.zeros((32, 32, 3), np.uint8)})
     write_demonstrations(tmp_path / "demonstrations", num_episodes=1, num_steps=6)
-    with pytest.raises(UserError, match=r"episode-00000\.mcap has a state or an action that is not finite"):
-        FrameStore.build(Recordings.of(tmp_path / "demonstrations"), tmp_path / "store", (32, 32), ("top",))
+    with pytest.raises(
+        UserError,
+        match=r"Episode episode-00000\.mcap: state of left/joint_1 \[rad\] must be finite, found nan at step 0",
+    ):
+        FrameStore.build(McapSource.of(tmp_path / "demonstrations"), tmp_path / "store", (32, 32), ("top",))
 
 
 def test_a_full_disk_is_named_and_the_store_stays(synthetic_demonstrations, built):
@@ -115,7 +121,7 @@ def test_a_full_disk_is_named_and_the_store_stays(synthetic_demonstrations, buil
         with pytest.raises(
             UserError, match=r"Cannot write frame store .*store: File too large; .* demos\.frames_directory"
         ):
-            FrameStore.build(Recordings.of(synthetic_demonstrations), built.path, (32, 32), ("front",))
+            FrameStore.build(McapSource.of(synthetic_demonstrations), built.path, (32, 32), ("front",))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert FrameStore.open(built.path).views == VIEWS
@@ -127,7 +133,7 @@ def test_too_little_room_is_noticed_before_decoding(synthetic_demonstrations, tm
 
     monkeypatch.setattr("imfvla.data.frame_store.shutil.disk_usage", lambda path: Full)
     with pytest.raises(UserError, match=r"needs 0\.0 GB, found 0\.0 GB free"):
-        FrameStore.build(Recordings.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
+        FrameStore.build(McapSource.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
 
 
 @pytest.mark.parametrize("name", ["images.raw", "image_steps.npy", "state.npy", "action.npy", "meta.json"])

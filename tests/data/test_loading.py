@@ -11,13 +11,16 @@ from synthetic import VIEWS
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
-from imfvla.recording import Recordings
+from imfvla.sources.mcap import McapSource
+from imfvla.tasks.bimanual_robot import bimanual_robot
+
+ROBOT = bimanual_robot(VIEWS, (32, 32))
 
 
 @pytest.fixture
 def windows(synthetic_demonstrations, tmp_path) -> Windows:
-    store = FrameStore.build(Recordings.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
-    return Windows(store, Horizon(1, 8, 4))
+    store = FrameStore.build(McapSource.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
+    return Windows(store, Horizon(1, 8, 4), ROBOT)
 
 
 def assert_same(left, right) -> None:

@@ -9,8 +9,10 @@ from imfvla.data import FrameStore, Statistics, Windows
 from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
-from imfvla.recording import Recordings
+from imfvla.sources.mcap import McapSource
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
+ROBOT = bimanual_robot(VIEWS, (8, 8))
 NUM_STEPS = 21
 NUM_EPISODES = 2
 
@@ -18,7 +20,7 @@ NUM_EPISODES = 2
 def build(directory, camera_every: int) -> FrameStore:
     options = {"num_steps": NUM_STEPS, "image_size": (8, 8), "camera_every": camera_every}
     write_demonstrations(directory / "demonstrations", num_episodes=NUM_EPISODES, **options)
-    return FrameStore.build(Recordings.of(directory / "demonstrations"), directory / "store", (8, 8), VIEWS)
+    return FrameStore.build(McapSource.of(directory / "demonstrations"), directory / "store", (8, 8), VIEWS)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ HORIZONS = [(1, 1, 1), (1, 8, 4), (1, 16, 16), (2, 8, 4), (2, 8, 8), (3, 16, 5),
 
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
-    windows = Windows(dense, Horizon(*horizon))
+    windows = Windows(dense, Horizon(*horizon), ROBOT)
     batch = whole(windows)
     assert len(windows) == NUM_EPISODES * NUM_STEPS
     for seed in range(NUM_EPISODES):
@@ -58,9 +60,9 @@ def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
 
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_a_window_sees_what_a_rollout_would_see(dense, horizon):
-    windows = Windows(dense, Horizon(*horizon))
+    windows = Windows(dense, Horizon(*horizon), ROBOT)
     batch = whole(windows)
-    scene = StillScene(VIEWS, (8, 8))
+    scene = StillScene(bimanual_robot(VIEWS, (8, 8)))
     for row in range(0, len(windows), 5):
         recorded = synthetic_actions(int(windows.episodes[row]), NUM_STEPS)
         for past, step in enumerate(windows.horizon.observed_steps(windows.steps[row])):
@@ -74,7 +76,7 @@ def test_a_window_sees_what_a_rollout_would_see(dense, horizon):
 
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_valid_ends_with_the_episode(dense, horizon):
-    windows = Windows(dense, Horizon(*horizon))
+    windows = Windows(dense, Horizon(*horizon), ROBOT)
     batch = whole(windows)
     left = torch.from_numpy(NUM_STEPS - windows.steps).clamp(max=windows.horizon.pred)
     np.testing.assert_array_equal(batch.valid.sum(dim=1), left)
@@ -83,7 +85,7 @@ def test_valid_ends_with_the_episode(dense, horizon):
 
 
 def test_valid_actions_are_of_their_own_episode(dense):
-    windows = Windows(dense, Horizon(1, 32, 16))
+    windows = Windows(dense, Horizon(1, 32, 16), ROBOT)
     batch = whole(windows)
     for row in range(len(windows)):
         recorded = synthetic_actions(int(windows.episodes[row]), NUM_STEPS)[windows.steps[row] :]
@@ -93,7 +95,7 @@ def test_valid_actions_are_of_their_own_episode(dense):
 
 
 def test_sparse_frames_decide_where_they_are(sparse):
-    windows = Windows(sparse, Horizon(1, 4, 2))
+    windows = Windows(sparse, Horizon(1, 4, 2), ROBOT)
     assert windows.steps.tolist() == list(range(0, NUM_STEPS, 2)) * NUM_EPISODES
 
 
@@ -101,11 +103,11 @@ def test_sparse_frames_cannot_serve_two_consecutive_observations(sparse):
     with pytest.raises(
         UserError, match=r"horizon\.obs=2 .* collect with camera_every=1, or set horizon\.obs=1"
     ):
-        Windows(sparse, Horizon(2, 4, 2))
+        Windows(sparse, Horizon(2, 4, 2), ROBOT)
 
 
 def test_a_batch_has_the_types_that_policies_expect(sparse):
-    batch = Windows(sparse, Horizon(1, 4, 2)).batch(np.array([3, 1]), np.random.default_rng(0))
+    batch = Windows(sparse, Horizon(1, 4, 2), ROBOT).batch(np.array([3, 1]), np.random.default_rng(0))
     assert (batch.obs.images.dtype, batch.obs.images.shape) == (torch.uint8, (2, 1, 3, 3, 8, 8))
     assert (batch.obs.state.dtype, batch.obs.state.shape) == (torch.float32, (2, 1, 16))
     assert (batch.obs.instruction.dtype, batch.obs.instruction.shape) == (torch.int64, (2, 16))
@@ -116,19 +118,19 @@ def test_a_batch_has_the_types_that_policies_expect(sparse):
 
 
 def test_instructions_are_drawn_among_an_episodes_sentences(sparse):
-    windows = Windows(sparse, Horizon(1, 4, 2))
+    windows = Windows(sparse, Horizon(1, 4, 2), ROBOT)
     drawn = windows.batch(np.zeros(400, int), np.random.default_rng(0)).obs.instruction
     expected = {tuple(tokenize(text)) for text in (INSTRUCTION, *PARAPHRASES)}
     assert set(map(tuple, drawn.tolist())) == expected
     again = windows.batch(np.zeros(400, int), np.random.default_rng(0)).obs.instruction
     assert torch.equal(drawn, again)
-    windows = Windows(sparse, Horizon(1, 4, 2), paraphrases=False)
+    windows = Windows(sparse, Horizon(1, 4, 2), ROBOT, paraphrases=False)
     said = windows.batch(np.zeros(9, int), np.random.default_rng(0)).obs.instruction
     assert (said == torch.from_numpy(tokenize(INSTRUCTION))).all()
 
 
 def test_statistics_cover_every_control_step(sparse):
-    statistics = Windows(sparse, Horizon(1, 4, 2)).statistics()
+    statistics = Windows(sparse, Horizon(1, 4, 2), ROBOT).statistics()
     actions = np.concatenate([synthetic_actions(seed, NUM_STEPS) for seed in range(NUM_EPISODES)])
     np.testing.assert_array_equal(statistics.action_min, actions.min(axis=0))
     np.testing.assert_array_equal(statistics.action_max, actions.max(axis=0))
@@ -139,7 +141,7 @@ def test_statistics_cover_every_control_step(sparse):
 
 
 def test_statistics_survive_json(sparse):
-    statistics = Windows(sparse, Horizon(1, 4, 2)).statistics()
+    statistics = Windows(sparse, Horizon(1, 4, 2), ROBOT).statistics()
     back = Statistics.from_json(statistics.to_json())
     for name in Statistics.__slots__:
         np.testing.assert_array_equal(getattr(back, name), getattr(statistics, name))

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from hydra.utils import instantiate
 
 from imfvla.composition import compose
+from imfvla.construction import construct
 
 TRUNKS = {
     "compact": "CompactCNN",
@@ -18,12 +18,12 @@ TRUNKS = {
 @pytest.mark.parametrize("tokens", [1, 4])
 @pytest.mark.parametrize("encoder", TRUNKS)
 def test_encoder_composes_and_builds(encoder, tokens):
-    config = compose("train", [f"encoder={encoder}", f"encoder.view_tokens.tokens={tokens}"])["encoder"]
+    config = compose("train", [f"encoder={encoder}", f"encoder.view_tokens.tokens={tokens}"])
     with torch.device("meta"):
-        made = instantiate(config, _convert_="all")
+        made = construct(config["encoder"], "encoder", views=3, state_dim=5)
     assert type(made.vision).__name__ == TRUNKS[encoder]
     assert made.view_tokens.tokens == tokens
-    assert made.summary.in_features == (config["views"] * tokens + 2) * config["width"]
+    assert made.summary.in_features == (3 * tokens + 2) * config["core"]["width"]
 
 
 @pytest.mark.parametrize(("scale", "trunk"), [("cpu", "CompactResNet"), ("paper", "ResNet18")])

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 from imfvla.modes.grippers import (
-    LEFT,
-    RIGHT,
     Event,
     closed_by,
     closings,
     event_of,
     fates,
+    grippers_of,
     measure_closings,
     release_delay,
 )
+from imfvla.tasks.bimanual_robot import bimanual_robot
+
+GRIPPERS = LEFT, RIGHT = grippers_of(bimanual_robot((), (8, 8)))
 
 PRED, EXEC, NEVER = 32, 16, 99
 HANDOVER = Event(100, LEFT, RIGHT)
@@ -38,25 +40,31 @@ def test_the_delay_is_counted_from_the_left_hand_closing(left_closes, right_open
     actions = np.ones((50, 16), np.float32)
     actions[left_closes:, LEFT] = 0.0
     actions[10:right_opens, RIGHT] = 0.2
-    assert release_delay(actions) == expected
+    assert release_delay(actions, LEFT, RIGHT) == expected
 
 
 def test_hands_that_never_switch_have_no_delay():
     actions = np.ones((50, 16), np.float32)
-    assert release_delay(actions) is None
+    assert release_delay(actions, LEFT, RIGHT) is None
     actions[10:, RIGHT] = 0.0
-    assert release_delay(actions) is None
+    assert release_delay(actions, LEFT, RIGHT) is None
 
 
 def test_the_event_of_a_demonstration_is_its_last_closing():
     actions = np.ones((50, 16), np.float32)
-    assert event_of(actions) is None
+    assert event_of(actions, GRIPPERS) is None
     actions[10:34, RIGHT] = 0.0
-    assert event_of(actions) == Event(10, RIGHT, None)
+    assert event_of(actions, GRIPPERS) == Event(10, RIGHT, None)
     actions[30:, LEFT] = 0.0
-    assert event_of(actions) == Event(30, LEFT, RIGHT)
+    assert event_of(actions, GRIPPERS) == Event(30, LEFT, RIGHT)
     actions[:, RIGHT] = 1.0  # never held anything: nothing to let go
-    assert event_of(actions) == Event(30, LEFT, None)
+    assert event_of(actions, GRIPPERS) == Event(30, LEFT, None)
+
+
+def test_a_robot_with_one_gripper_has_nothing_to_let_go():
+    actions = np.ones((50, 3), np.float32)
+    actions[20:, 2] = 0.0
+    assert event_of(actions, (2,)) == Event(20, 2, None)
 
 
 def test_samples_that_do_as_the_demonstrations_do_have_no_fault():

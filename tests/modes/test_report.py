@@ -10,20 +10,23 @@ from torch import nn
 from imfvla.errors import UserError
 from imfvla.figures.modes import modes_figure
 from imfvla.horizon import Horizon
-from imfvla.modes.grippers import LEFT, RIGHT
+from imfvla.modes.grippers import grippers_of
 from imfvla.modes.observations import Stops
 from imfvla.modes.report import DEMONSTRATIONS, measure, modes_table
+from imfvla.tasks.bimanual_robot import bimanual_robot
 from imfvla.types import Observation
 
 HORIZON = Horizon(1, 32, 16)
 CLOSES, NUM_STEPS, WAIT = 60, 120, 20
 WRIST = 14
+ROBOT = bimanual_robot(("front",), (8, 8))
+GRIPPERS = LEFT, RIGHT = grippers_of(ROBOT)
 
 
 class TwoWays(nn.Module):
     """Follows the demonstration, and rolls the wrist either way by the sign of its noise; one NFE ends between."""
 
-    horizon, noise_shape = HORIZON, (32, 16)
+    horizon, noise_shape, robot = HORIZON, (32, 16), ROBOT
 
     def __init__(self, actions: np.ndarray) -> None:
         super().__init__()
@@ -53,7 +56,7 @@ def actions() -> np.ndarray:
 
 
 def stops_of(actions: np.ndarray, wait: int = WAIT) -> Stops:
-    stops = Stops(HORIZON, ("front",), num_episodes=2, most=50)
+    stops = Stops(HORIZON, ("front",), GRIPPERS, num_episodes=2, most=50)
     for seed in range(2):
         state = np.zeros((NUM_STEPS, 16), np.float32)
         state[:, 0] = np.arange(NUM_STEPS)

@@ -3,16 +3,19 @@
 import numpy as np
 import pytest
 
-from imfvla.episode import ACTION_NAMES
 from imfvla.modes.turns import STEPS, drawn_wrists, measure_turns, turns
+from imfvla.robot import bare_name
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
-WRIST = ACTION_NAMES.index("right/joint_7")
+ROBOT = bimanual_robot((), (8, 8))
+NAMES = [bare_name(channel) for channel in ROBOT.action]
+WRIST = NAMES.index("right/joint_7")
 
 
 def test_wrists_are_those_whose_way_the_expert_draws():
-    assert drawn_wrists(1) == ()
-    assert drawn_wrists(2) == (WRIST,)
-    assert [ACTION_NAMES[wrist] for wrist in drawn_wrists(4)] == ["left/joint_7", "right/joint_7"]
+    assert drawn_wrists(1, ROBOT) == ()
+    assert drawn_wrists(2, ROBOT) == (WRIST,)
+    assert [NAMES[wrist] for wrist in drawn_wrists(4, ROBOT)] == ["left/joint_7", "right/joint_7"]
 
 
 def test_rolls_count_from_the_state_and_at_one_step():

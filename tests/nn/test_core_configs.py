@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from hydra.utils import instantiate
 
 from imfvla.composition import compose
+from imfvla.construction import construct
 from imfvla.errors import UserError
 from imfvla.policy import build_policy
 
@@ -21,12 +21,12 @@ SIZES = {"default": [], "emb384-layer18": ["core.width=384", "core.depth=18", "c
 @pytest.mark.parametrize("conditioning", CONDITIONING)
 @pytest.mark.parametrize("residual", RESIDUALS)
 def test_core_composes_and_builds(residual, conditioning, size):
-    config = compose("train", [f"core={residual}", f"core/conditioning={conditioning}", *SIZES[size]])["core"]
+    config = compose("train", [f"core={residual}", f"core/conditioning={conditioning}", *SIZES[size]])
     with torch.device("meta"):
-        core = instantiate(config, _convert_="all")
+        core = construct(config["core"], "core", channels=5)
     assert type(core).__name__ == CONDITIONING[conditioning]
     assert type(core.residual).__name__ == RESIDUALS[residual]
-    assert (core.width, len(core.blocks)) == (config["width"], config["depth"])
+    assert (core.width, len(core.blocks)) == (config["core"]["width"], config["core"]["depth"])
     context = core.condition(torch.empty(2, 5, core.width, device="meta"))
     times = torch.empty(2, device="meta")
     x = torch.empty(2, core.steps, core.channels, device="meta")
@@ -34,9 +34,9 @@ def test_core_composes_and_builds(residual, conditioning, size):
 
 
 def test_the_deep_row_has_width_384_and_18_layers_at_the_paper_s_scale():
-    config = compose("train", ["+exp=transfer_ddpm_emb384_layer18", "scale=paper"])["core"]
+    config = compose("train", ["+exp=transfer_ddpm_emb384_layer18", "scale=paper"])
     with torch.device("meta"):
-        core = instantiate(config, _convert_="all")
+        core = construct(config["core"], "core", channels=5)
     assert (core.width, len(core.blocks)) == (384, 18)
 
 

@@ -17,6 +17,7 @@ from synthetic import StillScene, synthetic_actions, write_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.recording import McapSink, TruncatedRecording, read_episode, read_index
+from imfvla.tasks.bimanual_robot import bimanual_robot
 
 VIEWS = ("front", "top")
 INFO = EpisodeInfo(
@@ -26,7 +27,7 @@ INFO = EpisodeInfo(
     start_digest="0123456789abcdef",
     instruction="insert the peg",
     views=VIEWS,
-    image_size=(16, 24),
+    robot=bimanual_robot(VIEWS, (16, 24)),
     config={"name": "run", "horizon": {"pred": 32}, "sizes": [1, 2.5, None]},
     metadata={"nfe": 2, "style": {"speed": np.float32(0.5)}},
 )
@@ -46,7 +47,7 @@ RESULT = EpisodeResult(
 
 @pytest.fixture
 def scene() -> StillScene:
-    return StillScene(VIEWS, (16, 24))
+    return StillScene(INFO.robot)
 
 
 def steps(num_steps: int = 6) -> list[Step]:
@@ -121,7 +122,7 @@ def test_an_episode_comes_back_exactly(tmp_path, scene):
 def test_rendered_frames_show_the_state_before_the_action(tmp_path):
     write_episode(tmp_path / "a.mcap", 7, num_steps=9, views=VIEWS, image_size=(16, 24), camera_every=2)
     read = read_episode(tmp_path / "a.mcap")
-    scene = StillScene(VIEWS, (16, 24))
+    scene = StillScene(INFO.robot)
     assert read.image_steps.tolist() == [0, 2, 4, 6, 8]
     for row, step in enumerate(read.image_steps):
         scene.position = read.state[step, 0]

@@ -67,22 +67,24 @@ def test_an_episode_is_filmed_in_real_time(tmp_path):
         asked.append((view, height, width))
         return np.zeros((height, width, 3), np.uint8)
 
-    sink = VideoSink(tmp_path / "a.mp4", views=("front", "top"), size=(24, 32), every=2)
-    env = SimpleNamespace(render=render)
+    sink = VideoSink(tmp_path / "a.mp4", views=("front", "top"), height=24)
+    env = SimpleNamespace(render=render, stages=("reach",))
     sink.begin(env, INFO)
     for step in steps():
         sink.step(env, step)
     sink.end(RESULT)
-    assert asked == [("front", 24, 32), ("top", 24, 32)] * 3
+    assert asked == [("front", 24, 36), ("top", 24, 36)] * 3
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].average_rate == 25
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
 def test_an_aborted_film_leaves_nothing(tmp_path):
-    sink = VideoSink(tmp_path / "a.mp4", views=("front",), size=(24, 32))
+    sink = VideoSink(tmp_path / "a.mp4", views=("front",), height=24)
     sink.abort()
-    env = SimpleNamespace(render=lambda view, height, width: np.zeros((height, width, 3), np.uint8))
+    env = SimpleNamespace(
+        render=lambda view, height, width: np.zeros((height, width, 3), np.uint8), stages=()
+    )
     sink.begin(env, INFO)
     sink.step(env, steps()[0])
     sink.abort()

@@ -18,6 +18,7 @@ from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
 from imfvla.run_directory import RunDirectory
 from imfvla.signals import Stopped
+from imfvla.sources.mcap import McapSource
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
@@ -76,12 +77,11 @@ def composed_parts(job: Job) -> tuple[Any, ...]:
     from imfvla.composition import compose  # here: the tiny policy starts sooner without
     from imfvla.options import build
     from imfvla.policy import build_policy
-    from imfvla.recording import Recordings
     from imfvla.training.data import make_loader, prepare_windows
     from imfvla.training.options import OptimOptions, TrainingOptions
 
     config = compose("train", job.overrides)
-    windows = prepare_windows(config, Recordings.of(job.demos))
+    windows = prepare_windows(config, McapSource.of(job.demos))
     torch.manual_seed(0)
     return (
         build_policy(config, windows.statistics()),

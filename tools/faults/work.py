@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -10,6 +9,7 @@ from fakes import FakeEnvironment, build_fakes, known_actions
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
 from imfvla import collection, workbench
+from imfvla.environment import Environment
 from imfvla.episode import Decision
 from imfvla.evaluation import evaluate
 from imfvla.protocol import EvaluationOptions
@@ -41,10 +41,10 @@ def roll_out(folder: Path, episodes: int) -> None:
 class Demonstrator:
     """Does what is known; its environment counts every fourth seed as a success."""
 
-    def reset(self, env: Any, seed: int) -> None:
+    def reset(self, env: Environment, seed: int) -> None:
         self.actions = known_actions(40)
 
-    def act(self, env: Any, state: np.ndarray, step: int) -> Decision:
+    def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
         return Decision(self.actions[step], self.actions[step])
 
 
@@ -52,7 +52,6 @@ def collect(folder: Path, episodes: int) -> None:
     """Demonstrations, three of four of which fail."""
     env = FakeEnvironment()
     env.model_digest = lambda: "0" * 16
-    env.paraphrases = ()
     collection._stage_for = lambda settings: (env, Demonstrator())
     task = {
         "name": "fake",

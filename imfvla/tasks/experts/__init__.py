@@ -1,18 +1,11 @@
 """Scripted demonstrators: they read the simulator, and their recorded actions are what policies learn."""
 
-from imfvla.errors import UserError
+from imfvla.tasks.catalogue import class_at, entry_of
 from imfvla.tasks.experts.base import Expert
-from imfvla.tasks.experts.combined import CombinedExpert
-from imfvla.tasks.experts.socket import SocketExpert
-from imfvla.tasks.experts.transfer import TransferExpert
 
-_EXPERTS = {"socket": SocketExpert, "transfer": TransferExpert, "combined": CombinedExpert}
+__all__ = ["Expert", "make_expert"]
 
 
 def make_expert(name: str, *, modes: int, noise: float, hold: int, dwell: int) -> Expert:
     """The expert of the task `name`; see `Expert` for the rest. UserError on an unknown name."""
-    if name not in _EXPERTS:
-        raise UserError(
-            f"There is no expert for a task {name!r}; choose one of {', '.join(sorted(_EXPERTS))}."
-        )
-    return _EXPERTS[name](modes=modes, noise=noise, hold=hold, dwell=dwell)
+    return class_at(entry_of(name).expert)(modes=modes, noise=noise, hold=hold, dwell=dwell)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.episode import ACTION_DIM, Decision
+from imfvla.episode import Decision
 from imfvla.errors import UserError
 from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, BimanualTask, Pose
 from imfvla.tasks.kinematics import ArmKinematics, about_z, rotation_matrix, rotation_vector
@@ -120,8 +120,8 @@ class Expert:
             **self.draw_style(rng),
         }
         self._noise_rng = np.random.default_rng(np.random.SeedSequence([seed, _NOISE_STREAM]))
-        self._disturbance = np.zeros(ACTION_DIM)
-        self._limits = env.action_spec().minimum, env.action_spec().maximum
+        self._disturbance = np.zeros(len(env.robot.action))
+        self._limits = tuple(np.float32(limits) for limits in (env.robot.action_min, env.robot.action_max))
         self._steps_since_success = -1
 
     def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
@@ -138,9 +138,9 @@ class Expert:
             hand.measure(env, state)
         self.command(env, self.task.contacts(env.physics))
         clean = np.concatenate([self.hands[side].command for side in SIDES])
-        fresh = self._noise_rng.standard_normal(ACTION_DIM)
+        fresh = self._noise_rng.standard_normal(len(self._disturbance))
         self._disturbance = NOISE_CORRELATION * self._disturbance + np.sqrt(1 - NOISE_CORRELATION**2) * fresh
-        scale = np.zeros(ACTION_DIM)
+        scale = np.zeros(len(self._disturbance))
         for side in SIDES:
             scale[_ARM[side]] = self.noise * self.hands[side].freedom
         disturbed = clean + scale * self._disturbance
@@ -149,7 +149,7 @@ class Expert:
 
     def done(self, env: BimanualEnvironment) -> bool:
         """Whether success has been held long enough to end the demonstration; to be asked once after each step."""
-        if self._steps_since_success >= 0 or env.stage() >= env.success_stage:
+        if self._steps_since_success >= 0 or env.stage() >= len(env.stages):
             self._steps_since_success += 1
         return self._steps_since_success >= self.hold
 

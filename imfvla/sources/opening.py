@@ -1,0 +1,39 @@
+"""Opens the source of episodes that `demos` chooses. Each kind is a module beside this one, imported when chosen."""
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from imfvla.options import one_of, part_of, require
+from imfvla.sources.base import EpisodeSource
+
+SCRIPTED = "scripted"  # the expert of our own tasks; missing demonstrations are recorded
+KINDS = (SCRIPTED, "mcap", "lerobot", "ros2", "hdf5")
+SHARED = (
+    "source",
+    "frames_directory",
+)  # keys of `demos` that every kind has, and that its module is not given
+
+
+def kind_of(config: Mapping[str, Any]) -> str:
+    """Which source `demos.source` names; configs from before that key are of the scripted expert."""
+    kind = part_of(config, "demos").get("source", SCRIPTED)
+    allowed = one_of(*KINDS)
+    require(isinstance(kind, str) and allowed.holds(kind), "demos.source", allowed.wanted, kind)
+    return kind
+
+
+def open_source(config: Mapping[str, Any]) -> EpisodeSource:
+    """The episodes that a config composed from `conf/train.yaml` trains on.
+
+    The scripted expert records missing demonstrations first. Raises UserError where options are wrong or files are
+    missing or damaged.
+    """
+    kind = kind_of(config)
+    if kind == SCRIPTED:
+        # Imported here: a data set needs no simulator.
+        from imfvla.sources.scripted import open_source as open_scripted
+
+        return open_scripted(config)
+    options = {key: value for key, value in config["demos"].items() if key not in SHARED}
+    return import_module(f"imfvla.sources.{kind}").open_source(options, where="demos")

@@ -1,0 +1,83 @@
+"""Recordings as a source of episodes, and which source a config opens."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, write_demonstrations, write_episode
+
+from imfvla.composition import compose
+from imfvla.errors import UserError
+from imfvla.sources import mcap, opening
+from imfvla.sources.mcap import McapSource
+from imfvla.tasks.bimanual_robot import bimanual_robot
+
+
+def test_episodes_are_those_that_were_recorded(synthetic_demonstrations):
+    source = McapSource.of(synthetic_demonstrations)
+    assert (len(source), source.num_frames(1)) == (3, 12)
+    assert source.robot == bimanual_robot(VIEWS, (32, 32))
+    episode = source.episode(1, ("top",))
+    assert (episode.name, episode.task) == ("episode-00001.mcap", "socket")
+    assert episode.instructions == (INSTRUCTION, *PARAPHRASES)
+    assert (episode.state.shape, episode.action.shape) == ((24, 16), (24, 16))
+    assert {view: pictures.shape for view, pictures in episode.images.items()} == {"top": (12, 32, 32, 3)}
+    assert source.episode(1).images == {}
+    np.testing.assert_array_equal(episode.image_steps, np.arange(0, 24, 2))
+
+
+def test_the_digest_changes_with_a_file(synthetic_demonstrations):
+    before = McapSource.of(synthetic_demonstrations).digest()
+    assert before == McapSource.of(synthetic_demonstrations).digest()
+    write_episode(synthetic_demonstrations / "episode-00001.mcap", seed=9)
+    assert before != McapSource.of(synthetic_demonstrations).digest()
+
+
+def test_recordings_of_different_robots_are_not_mixed(synthetic_demonstrations):
+    write_episode(synthetic_demonstrations / "episode-00002.mcap", seed=2, image_size=(32, 40))
+    source = McapSource.of(synthetic_demonstrations)
+    with pytest.raises(
+        UserError,
+        match=r"episode-00002\.mcap has another robot .*00000\.mcap: camera top must have .* 32 x 40\. Keep",
+    ):
+        source.episode(2, ("top",))
+
+
+def test_a_config_opens_what_its_source_says(synthetic_demonstrations):
+    config = compose("train", ["task=none", "demos=mcap", f"demos.directory={synthetic_demonstrations}"])
+    assert isinstance(opening.open_source(config), McapSource)
+    assert opening.kind_of(config) == "mcap"
+    assert opening.kind_of({"demos": {"episodes": 1}}) == "scripted"  # as configs from before the key
+
+
+def test_an_unknown_source_or_option_is_named(synthetic_demonstrations):
+    config = compose("train", ["demos=mcap", f"demos.directory={synthetic_demonstrations}"])
+    with pytest.raises(
+        UserError, match=r"demos\.source must be one of scripted, mcap, lerobot, .*found 'tape'"
+    ):
+        opening.open_source(config | {"demos": config["demos"] | {"source": "tape"}})
+    with pytest.raises(UserError, match=r"Unknown key demos\.folder"):
+        mcap.open_source({"directory": "x", "folder": "y"})
+
+
+def test_a_folder_without_recordings_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"No recordings .*nowhere"):
+        mcap.open_source({"directory": str(tmp_path / "nowhere")})
+
+
+def test_paraphrases_that_are_no_texts_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("synthetic.PARAPHRASES", {"not": "a list"})
+    source = McapSource.of(write_demonstrations(tmp_path / "demos", num_episodes=1))
+    with pytest.raises(UserError, match="paraphrases must be a list of texts"):
+        source.episode(0)
+
+
+def test_a_recording_may_state_its_robot(synthetic_demonstrations):
+    info = McapSource.of(synthetic_demonstrations)._index(0).info
+    stated = replace(bimanual_robot(VIEWS, (32, 32)), control_hz=20.0)
+
+    class Stating:
+        robot = stated
+
+    assert mcap.robot_of_recording(Stating()) == stated
+    assert mcap.robot_of_recording(info).control_hz == 50
