@@ -94,7 +94,7 @@ class AlohaExpert:
 
 
 def _freedom(action: np.ndarray) -> np.ndarray:
-    """The share of the noise (A,) that an action bears: all of an open hand, little of a closed one, none of fingers."""
+    """The share of the noise (A,) that an action bears: all of an open hand, little of a closed one, no finger."""
     arms = np.split(action, 2)
     share = [np.full(len(arm), WHILE_HOLDING + (1 - WHILE_HOLDING) * np.clip(arm[-1], 0, 1)) for arm in arms]
     freedom = np.concatenate(share)

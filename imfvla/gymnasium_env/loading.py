@@ -57,15 +57,16 @@ def _check_actions(space: Any, task: GymnasiumTask) -> None:
     shape, kind = getattr(space, "shape", None), type(space).__name__
     if kind != "Box" or shape != (count,):
         raise UserError(
-            f"task.robot.action names {count} numbers, but {task.id} takes {kind} {shape}: only one list of numbers fits, "
-            "one name each."
+            f"task.robot.action names {count} numbers, but {task.id} takes {kind} {shape}: it must take one list "
+            "of numbers, and each has its name."
         )
     for number, name in enumerate(task.robot.action):
         found = float(space.low[number]), float(space.high[number])
         wanted = task.robot.action_min[number], task.robot.action_max[number]
         if wanted[0] < found[0] - SLACK or wanted[1] > found[1] + SLACK:
             raise UserError(
-                f"task.robot.action_min and action_max of {name} must lie in {found}, as {task.id} says, found {wanted}."
+                f"task.robot.action_min and action_max of {name} must lie in {found}, the limits of {task.id}, "
+                f"found {wanted}."
             )
 
 
@@ -73,7 +74,8 @@ def _check_rate(metadata: Mapping[str, Any], task: GymnasiumTask) -> None:
     rate = metadata.get("render_fps")
     if rate is not None and abs(float(rate) - task.robot.control_hz) > SLACK * float(rate):
         raise UserError(
-            f"task.robot.control_hz must be {rate:g}, the frames per second of {task.id}, found {task.robot.control_hz:g}."
+            f"task.robot.control_hz must be {rate:g}, the frames per second of {task.id}, found "
+            f"{task.robot.control_hz:g}."
         )
 
 

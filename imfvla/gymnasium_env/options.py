@@ -145,7 +145,5 @@ def _check_source(source: str, key: str) -> None:
 
 
 def _check_place(place: str, key: str, others: str = "") -> None:
-    root = place.split("/")[0]
-    require(
-        root in (OBSERVATION, INFO), key, f"{others}a place below {OBSERVATION} or {INFO}, such as info/is_success", place
-    )  # fmt: skip
+    wanted = f"{others}a place below {OBSERVATION} or {INFO}, such as info/is_success"
+    require(place.split("/")[0] in (OBSERVATION, INFO), key, wanted, place)

@@ -9,7 +9,7 @@ from imfvla.errors import UserError
 
 
 def value_at(place: str, found: Mapping[str, Any], key: str) -> Any:
-    """The value of `found`, {"observation": ..., "info": ...}, at `place`. UserError naming `key` where there is none."""
+    """The value at `place` of {"observation": ..., "info": ...}. UserError naming `key` where there is none."""
     value: Any = found
     names = place.split("/")
     for number, name in enumerate(names):
