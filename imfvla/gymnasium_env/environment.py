@@ -76,8 +76,8 @@ class GymnasiumEnvironment:
         action, wanted = np.asarray(action, np.float32), (len(self.robot.action),)
         if action.shape != wanted or not np.isfinite(action).all():
             raise UserError(
-                f"An action of {self.task.id} must be {wanted[0]} finite numbers, found shape {action.shape}: {action}; check "
-                "the policy or script that chose it."
+                f"Actions of {self.task.id} must be {wanted[0]} finite numbers, found shape {action.shape}: {action}; "
+                "check the policy or script that chose it."
             )
         observation, reward, terminated, truncated, info = self.gymnasium.step(action)
         self._found = {"observation": observation, "info": info}
