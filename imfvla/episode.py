@@ -9,13 +9,6 @@ import numpy as np
 from imfvla.environment import Environment
 from imfvla.robot import RobotSpec
 
-CONTROL_HZ = 50
-STATE_DIM = 16
-ACTION_DIM = 16
-ACTION_NAMES = tuple(
-    f"{arm}/{name}" for arm in ("left", "right") for name in (*(f"joint_{i}" for i in range(1, 8)), "gripper")
-)
-
 
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:

@@ -13,6 +13,7 @@ import torch
 from imfvla.collection import check_demonstrations
 from imfvla.composition import EXECUTION_KEYS
 from imfvla.data.held_out import held_out
+from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
 from imfvla.gl import select_gl_backend
@@ -26,7 +27,8 @@ from imfvla.reporting.offline import print_offline
 from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
 from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
-from imfvla.sources.opening import SCRIPTED, kind_of, open_source
+from imfvla.same_robot import refuse_other_robot
+from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -54,7 +56,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
             initialise_from_pretrained(policy)
     run.refuse_links_outside()
     if has_environment(config) and run.status().get("state") != DONE:
-        select_gl_backend()  # without one, training would end before an evaluation that fails
+        _check_environment(config)  # else training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
         if not is_trained:
             processes.check(training)
@@ -64,9 +66,26 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
             _train(config, run, training, optim, processes)
 
 
+def _check_environment(config: Mapping[str, Any]) -> None:
+    """Raises UserError where nothing can be drawn, or where the environment has another robot than it states."""
+    if kind_of(config["task"]) == BIMANUAL:
+        select_gl_backend()
+        return
+    env = environment_of(config)
+    refuse_other_robot(
+        robot_of(config),
+        env.robot,
+        config["observation"]["views"],
+        of="task.robot",
+        where=f"The environment {env.name}",
+        remedy="Correct task.robot.",
+    )
+    env.close()
+
+
 def _check_source(config: Mapping[str, Any]) -> None:
     """Raises UserError where the episodes to learn from cannot be had, or are of another robot; records none."""
-    if kind_of(config) == SCRIPTED:
+    if source_kind(config) == SCRIPTED:
         require(
             has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED
         )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.figures.ablations import transfer_ablations
+from imfvla.figures.ablations import ablations
 from imfvla.figures.components import method_components
 from imfvla.figures.depth_attention import depth_attention, read_depth_attention
 from imfvla.figures.evaluations import success_by_evaluations
@@ -18,17 +18,21 @@ from imfvla.figures.style import render
 from imfvla.files import copy_file, write_together
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
+from imfvla.reporting.mapping import COMPARISONS, TableTitle
 from imfvla.reporting.mapping import Mapping as RowMapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import offline_table, read_offline
 from imfvla.reporting.page import Picture, page
-from imfvla.reporting.paper import TABLES
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import find_runs, key_of
 from imfvla.reporting.table import Table
-from imfvla.reporting.tables import Document, comparison_table, other_table, paper_table
+from imfvla.reporting.tables import Document, comparison_table, other_table, row_table
 
 MAX_HEAT_MAPS = 4
+OF_TABLE = {  # by `figure` of a table: what draws its rows, and what that shows
+    "reward_latency": (reward_latency, "average reward against the time of a chunk."),
+    "ablations": (ablations, "ablations and rivals."),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +73,8 @@ def publish(
     """
     sources = Sources(directories)
     answers = [sources.answer(row, mapping) for row in mapping.rows]
-    for number in TABLES:
-        check_equal_protocols([answer for answer in answers if answer.row.table == number])
+    for table in mapping.of_rows:
+        check_equal_protocols([answer for answer in answers if answer.row.table == table.name], table.task)
     results = [Result.of(answer) for answer in answers]
     others = [Result(found) for found in sources.others(answers)]
     offline = _offline(directories)
@@ -79,13 +83,11 @@ def publish(
             f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "
             "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
         )
-    of_table = {number: [result for result in results if result.row.table == number] for number in TABLES}
-    documents = {f"table{number}": paper_table(number, of_table[number]) for number in TABLES}
-    documents["table3"] = comparison_table(compare(mapping.comparisons, results))
+    documents = {table.name: _document(table, mapping, results) for table in mapping.tables}
     documents["others"] = other_table(others)
     if offline:
         documents["offline"] = offline_table(offline)
-    figures = _figures(of_table[1], of_table[2], others, method)
+    figures = _figures(mapping, results, others, method)
     pictures = [Picture(name, caption, files[".svg"]) for name, (caption, files) in figures.items()]
     tables = tuple(document.shown for document in documents.values())
     linked = Media(output, is_copied=media)
@@ -111,11 +113,17 @@ def _formats(document: Document) -> dict[str, str]:
     return {".md": document.shown.markdown(), ".csv": document.data.csv(), ".tex": document.shown.latex()}
 
 
+def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> Document:
+    if table.of == COMPARISONS:
+        return comparison_table(table.title, compare(mapping.comparisons, results))
+    return row_table(table.title, [result for result in results if result.row.table == table.name])
+
+
 def _figures(
-    socket: Sequence[Result], transfer: Sequence[Result], others: Sequence[Result], method: Mapping[str, Any]
+    mapping: RowMapping, results: Sequence[Result], others: Sequence[Result], method: Mapping[str, Any]
 ) -> dict[str, tuple[str, dict[str, bytes]]]:
     """Caption and files of each figure, by name."""
-    every = [*socket, *transfer, *others]
+    every = [*results, *others]
     drawn = {
         "figure1_overview": (
             method_overview(method),
@@ -125,14 +133,16 @@ def _figures(
             method_components(method),
             f"Figure 2. What the generator of {method['name']} learns, and what its sublayers read.",
         ),
-        "figure3_reward_latency": (
-            reward_latency(socket),
-            "Figure 3. Socket peg insertion: average reward against the time of a chunk. Bars are 95% intervals.",
-        ),
-        "figure4_ablations": (
-            transfer_ablations(transfer),
-            "Figure 4. Object transfer: ablations and rivals. Bars are 95% intervals.",
-        ),
+    }
+    for table in mapping.of_rows:
+        if table.figure is not None:
+            draw, shows = OF_TABLE[table.figure]
+            number = len(drawn) + 1
+            task = mapping.task(table.task).title
+            rows = [result for result in results if result.row.table == table.name]
+            caption = f"Figure {number}. {task[:1].upper()}{task[1:]}: {shows} Bars are 95% intervals."
+            drawn[f"figure{number}_{table.figure}"] = (draw(rows), caption)
+    drawn |= {
         "evaluations": (
             success_by_evaluations(every),
             "Success-like episodes against the number of network calls for a chunk. Bars are Wilson's 95% intervals.",
@@ -143,7 +153,7 @@ def _figures(
             "different units.",
         ),
         "failures": (
-            failed_stages([*socket, *transfer]),
+            failed_stages(results),
             "Where episodes of the tables' rows fail: the first stage that was not reached.",
         ),
         "failures_others": (

@@ -1,8 +1,10 @@
-"""Which robot a composed config is about: stated by the task, our own tasks' two arms, or what the data says."""
+"""Which robot a config is about: stated by the task, our own two arms, or what environment or data says."""
 
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
+from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.options import build, part_of
 from imfvla.robot import RobotSpec
 from imfvla.views import ViewOptions
@@ -45,8 +47,11 @@ def _robot(config: Mapping[str, Any], views: ViewOptions) -> RobotSpec:
     for where, group in ((KEY, config), (f"task.{KEY}", config.get("task", {}))):
         if group.get(KEY) is not None:
             return RobotSpec.from_json(group[KEY], where)
+    # Imported here: a robot that is stated needs neither tasks nor data.
     if has_environment(config):
-        # Imported here, as the next one is: a robot that is stated needs neither tasks nor data.
+        if kind_of(part_of(config, "task")) != BIMANUAL:
+            with closing(environment_of(config)) as env:
+                return env.robot
         from imfvla.tasks.bimanual_robot import bimanual_robot
 
         return bimanual_robot(views.views, views.image_size)

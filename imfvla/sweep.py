@@ -36,7 +36,6 @@ from imfvla.jobs import Failure, Job
 from imfvla.options import build, is_whole, require
 from imfvla.progress import Progress
 from imfvla.reporting.mapping import LAST, TableRow, read_mapping
-from imfvla.reporting.paper import TABLES
 from imfvla.run_directory import EXECUTION_KEYS, differences
 
 GROUP = "sweep"
@@ -49,7 +48,7 @@ log = logging.getLogger(__name__)
 class SweepOptions:
     """A file of conf/sweep."""
 
-    tables: tuple[int, ...]  # of the paper: all their rows that a run answers
+    tables: tuple[str, ...]  # of experiments/tables.yaml: all their rows that a run answers
     # Overrides of each job; commas and ranges in one give every combination, as with -m.
     jobs: tuple[tuple[str, ...], ...]
 
@@ -288,7 +287,8 @@ def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tup
     config = loader.load_configuration(config_name, [f"+{GROUP}={name}"], RunMode.RUN)
     where = f"conf/{GROUP}/{name}.yaml"
     read = build(SweepOptions, OmegaConf.to_container(config[GROUP]), where)
-    require({*read.tables} <= {*TABLES}, f"{where}: tables", "a list of 1 and 2", read.tables)
+    known = [table.name for table in read_mapping().of_rows]
+    require({*read.tables} <= {*known}, f"{where}: tables", f"a list from {', '.join(known)}", read.tables)
     rows = [row for table in read.tables for row in read_mapping().of_table(table)]
     return [*jobs_of_rows(rows), *read.jobs]
 

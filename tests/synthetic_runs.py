@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from imfvla.reporting.mapping import TableRow
+from imfvla.reporting.mapping import TableRow, read_mapping
 from imfvla.reporting.metrics import summarise
 
 MACHINE = {"cpu": "a fast CPU", "cpu_flags": ["avx2"], "physical_cores": 2}
@@ -86,7 +86,7 @@ def answer_row(root: Path, row: TableRow, *, quality: float = 0.6, seed: int = 0
     """A run below `root` with the evaluation that a row wants; returns the evaluation's folder."""
     names = [name for name in (row.run, f"seed={seed}" if seed else "") if name]
     run = make_run(root / row.experiment / (",".join(names) or "default"), row.experiment, seed=seed)
-    task = "socket" if row.table == 1 else "transfer"
+    task = read_mapping().table(row.table).task
     defaults = {
         "task": task, "number": row.wanted.episodes, "step": row.step(STEPS), "latency_ms": 3.0 + 3.0 * row.nfe,
         "stream": row.nfe,

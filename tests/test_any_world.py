@@ -214,7 +214,7 @@ def test_a_world_that_is_not_of_its_robot_is_refused_before_anything_is_recorded
     env = PlainEnvironment(robot=ROBOT)
     env.state = lambda: np.zeros(3, np.float32)
     with pytest.raises(
-        UserError, match=r"environment fake does not fit .* state\(\) must be 7 numbers .* found .*\(3,\)"
+        UserError, match=r"environment fake does not fit .* state\(\) must be 7 numbers.* found .*\(3,\)"
     ):
         play(env, McapSink(tmp_path / "a.mcap"))
     env = PlainEnvironment(robot=ROBOT)

@@ -71,7 +71,7 @@ def described(row) -> str:
             )
         )
     both = (str(cpu) if cpu == paper else f"{cpu} / {paper}" for cpu, paper in zip(*cells, strict=True))
-    return f"| {row.table} | {row.label} | `{row.experiment}` | {' | '.join(both)} |"
+    return f"| {row.paper.table} | {row.label} | `{row.experiment}` | {' | '.join(both)} |"
 
 
 @pytest.mark.parametrize("row", [row for row in read_mapping().rows if row.paper], ids=lambda row: row.name)

@@ -80,7 +80,9 @@ def test_commands_in_documents_compose_and_build(command):
 
 # What a package may import of imfvla beside itself and `errors`, and which of the heavy packages.
 MAY_IMPORT = {
-    "episode": set(),
+    "environment": {"robot"},
+    "environments": {"environment", "gymnasium_env", "options", "tasks", "views"},
+    "episode": {"environment", "robot"},
     "horizon": set(),
     "protocol": {"options"},
     "nn": {"torch", "options"},
@@ -88,7 +90,7 @@ MAY_IMPORT = {
     "generators": {"torch", "nn", "options"},
     "robot": {"options"},
     "same_robot": {"robot"},
-    "robot_of": {"options", "robot", "sources", "tasks", "views"},
+    "robot_of": {"environments", "options", "robot", "sources", "tasks", "views"},
     "resample": set(),
     "chunks": {"torch", "nn", "robot", "statistics"},
     "construction": {"torch", "options"},
@@ -105,10 +107,10 @@ MAY_IMPORT = {
         "statistics",
         "types",
     },
-    "tasks": {"mujoco", "dm_control", "episode", "gl", "options", "robot", "views"},
-    "recording": {"documents", "episode", "files"},
+    "tasks": {"mujoco", "dm_control", "environment", "episode", "gl", "options", "robot", "views"},
+    "recording": {"documents", "environment", "episode", "files", "robot", "tasks"},
     "reporting": {"documents", "episode", "files", "options", "protocol", "robot", "run_directory"},
-    "figures": {"documents", "reporting", "robot_of"},
+    "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
     "sources": {"collection", "episode", "options", "recording", "robot", "same_robot", "tasks"},
     "demonstrations": {
         "environment",

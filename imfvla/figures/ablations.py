@@ -1,4 +1,4 @@
-"""Figure 4: object transfer, average reward and success-like episodes of every row as grouped bars."""
+"""Average reward and success-like episodes of every row of a table as grouped bars."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from imfvla.reporting.results import Result
 BAR = 0.38  # share of the distance between two groups
 
 
-def transfer_ablations(results: Sequence[Result]) -> Figure:
+def ablations(results: Sequence[Result]) -> Figure:
     """A group for each row, the paper's bar beside ours; 95% intervals on ours and on the paper's counts."""
     with style():
         figure = new_figure(WIDTH, 1.4 + 0.36 * len(results))

@@ -4,7 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from imfvla.robot_of import robot_of
+from imfvla.environments import BIMANUAL
+from imfvla.robot import bare_name, unit_of
+from imfvla.robot_of import has_environment, robot_of
 
 VISION = {"CompactCNN": "compact CNN", "CompactResNet": "compact ResNet", "ResNet18": "ResNet18"}
 CORE = {
@@ -29,6 +31,7 @@ TIMES = {
     "LogitNormalTimes": "logit-normal times",
     "BetaTimes": "beta times",
 }
+WORLD = {BIMANUAL: "MuJoCo simulation"}
 STANDARD, ATTENTION, BLOCK = "standard", "attention", "block"
 RESIDUAL = {"StandardResidual": STANDARD, "AttentionResidual": ATTENTION, "BlockAttentionResidual": BLOCK}
 
@@ -42,6 +45,9 @@ class Method:
     image_size: tuple[int, int]
     observed_steps: int
     state_dim: int
+    state: str  # what its channels are, in a word or two
+    control_hz: float
+    world: str  # what plays the episodes
     vision: str
     vision_residual: str  # STANDARD or ATTENTION
     view_tokens: int | None  # of each view
@@ -80,6 +86,7 @@ class Method:
 
 def describe(config: Mapping[str, Any]) -> Method:
     """The method of a config that `conf/train.yaml` composed."""
+    robot = robot_of(config)
     encoder, core, generator = config["encoder"], config["core"], config["generator"]
     residual = core.get("residual", {})
     times = generator.get("times")
@@ -88,7 +95,12 @@ def describe(config: Mapping[str, Any]) -> Method:
         views=tuple(config["observation"]["views"]),
         image_size=tuple(config["observation"]["image_size"]),
         observed_steps=config["horizon"]["obs"],
-        state_dim=len(robot_of(config).state),
+        state_dim=len(robot.state),
+        state="joints and grippers" if all(map(_is_joint, robot.state)) else "state",
+        control_hz=robot.control_hz,
+        world=WORLD.get(config["task"].get("kind", BIMANUAL), "environment")
+        if has_environment(config)
+        else "recorded episodes",
         vision=_name(encoder.get("vision", encoder), VISION),
         vision_residual=encoder.get("vision", {}).get("residual", STANDARD),
         view_tokens=encoder.get("view_tokens", {}).get("tokens"),
@@ -124,6 +136,10 @@ def listing(numbers: Sequence[int]) -> str:
     if len(numbers) == 1:
         return str(numbers[0])
     return f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"
+
+
+def _is_joint(channel: str) -> bool:
+    return unit_of(channel) == "rad" or bare_name(channel).rpartition("/")[2] == "gripper"
 
 
 def _class(part: Mapping[str, Any]) -> str:

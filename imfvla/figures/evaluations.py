@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from imfvla.figures.names import policy_of
-from imfvla.figures.panels import TASKS, look, say_nothing_yet
+from imfvla.figures.panels import look, say_nothing_yet, tasks_of
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.results import Result
@@ -22,14 +22,15 @@ def success_by_evaluations(results: Sequence[Result]) -> Figure:
     last = sorted((result for result in results if result.is_last), key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]
-    panels = {task: _by_method([line for line in lines if line[0].task == task]) for task in TASKS}
-    changes = list(dict.fromkeys(_policy(line)[1] for line in lines if line[0].task in TASKS))
+    titles = tasks_of([line[0] for line in lines])
+    panels = {task: _by_method([line for line in lines if line[0].task == task]) for task in titles}
+    changes = list(dict.fromkeys(_policy(line)[1] for line in lines))
     rows = {task: -(-max(len(of_task), 1) // COLUMNS) for task, of_task in panels.items()}
     with style():
         figure = new_figure(WIDTH, 0.7 + 2.7 * sum(rows.values()))
-        parts = figure.subfigures(len(TASKS), 1, height_ratios=list(rows.values()))
-        for part, task in zip(parts, TASKS, strict=True):
-            part.suptitle(TASKS[task], x=0.01, ha="left", fontsize=11, weight="bold")
+        parts = figure.subfigures(len(titles), 1, height_ratios=list(rows.values()), squeeze=False)[:, 0]
+        for part, task in zip(parts, titles, strict=True):
+            part.suptitle(titles[task], x=0.01, ha="left", fontsize=11, weight="bold")
             axes = part.subplots(rows[task], COLUMNS, sharey=True, squeeze=False)
             _task(axes.ravel().tolist(), panels[task], changes)
             for side in axes[:, 0]:

@@ -9,15 +9,11 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from imfvla.figures.names import result_name
-from imfvla.figures.panels import TASKS, say_nothing_yet
+from imfvla.figures.panels import say_nothing_yet, stages_of, tasks_of
 from imfvla.figures.style import INK, VERMILION, WIDTH, new_figure, style
 from imfvla.reporting.metrics import Row
 from imfvla.reporting.results import Result
 
-STAGES = {
-    "socket": ("grasp both", "lift both", "at the mouth", "inside", "seated"),
-    "transfer": ("grasp", "lift", "both hold", "handed over"),
-}
 SHADES = LinearSegmentedColormap.from_list("failures", [VERMILION, "#fbe3d0"])
 BAR, FRAME = 0.19, 1.25  # inches: of a bar with its gap, of what is above and below the bars of a panel
 LEAST = 4  # percent that a number within a bar needs
@@ -29,16 +25,25 @@ def first_failed_stage(row: Row) -> int | None:
 
 
 def failed_stages(results: Sequence[Result]) -> Figure:
-    """A bar for each result: the share of episodes whose first failed stage is each of the stages."""
+    """A bar for each result: the share of episodes whose first failed stage is each of the stages.
+
+    A panel for each task; tasks without stages have none.
+    """
     measured = [result for result in results if not result.is_missing]
-    rows = {task: _sorted([result for result in measured if result.task == task]) for task in TASKS}
-    heights = [FRAME + BAR * max(len(found), 2) for found in rows.values()]
+    titles = tasks_of(measured)
+    rows = {task: _sorted([result for result in measured if result.task == task]) for task in titles}
+    stages = {task: names for task in titles if (names := stages_of(task, rows[task]))}
+    heights = [FRAME + BAR * max(len(rows[task]), 2) for task in stages]
     with style():
-        figure = new_figure(WIDTH, sum(heights))
-        for part, task in zip(figure.subfigures(len(TASKS), 1, height_ratios=heights), TASKS, strict=True):
+        figure = new_figure(WIDTH, sum(heights, start=0.0) or FRAME)
+        if not stages:
+            say_nothing_yet(figure.subplots(), "no task with stages")
+            return figure
+        parts = figure.subfigures(len(stages), 1, height_ratios=heights, squeeze=False)[:, 0]
+        for part, task in zip(parts, stages, strict=True):
             axes = part.subplots()
-            axes.set_title(TASKS[task], weight="bold")
-            _bars(axes, STAGES[task], rows[task])
+            axes.set_title(titles[task], weight="bold")
+            _bars(axes, stages[task], rows[task])
     return figure
 
 
@@ -59,7 +64,7 @@ def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
     places, left = np.arange(len(results)), np.zeros(len(results))
     for stage, label in enumerate(stages):
         shares = np.array([100 * count[stage] / count.total() for count in counts])
-        color = SHADES(stage / (len(stages) - 1))
+        color = SHADES(stage / max(len(stages) - 1, 1))
         axes.barh(places, shares, 0.75, left=left, color=color, edgecolor="white", linewidth=0.5, label=label)
         for place, share, start in zip(places, shares, left, strict=True):
             if share >= LEAST:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from imfvla.figures.description import ATTENTION, BLOCK, STANDARD, Method, describe, listing
 from imfvla.figures.diagram import Sheet
 from imfvla.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, SKY, VERMILION, style
+from imfvla.reporting.mapping import read_mapping
 
 WIDTH, HEIGHT = 128, 72
 FACES = {
@@ -44,9 +45,7 @@ def _observation(sheet: Sheet, method: Method) -> None:
         y = top - (index + 1) * each
         sheet.box(4, y + 0.4, 17, each - 0.8, [view], face="white", edge=SKY, size=7.5, rounding=0.6)
     sheet.text(12.5, top - number * each - 1.4, f"{height} × {width} pixels{steps}", 19, size=7)
-    sheet.box(
-        4, 27.5, 17, 5.2, [f"joints and grippers, {method.state_dim}"], edge=GREEN, size=7.5, rounding=0.6
-    )
+    sheet.box(4, 27.5, 17, 5.2, [f"{method.state}, {method.state_dim}"], edge=GREEN, size=7.5, rounding=0.6)
     sheet.box(4, 21.5, 17, 5.2, ["instruction"], edge=PURPLE, size=7.5, rounding=0.6)
     sheet.arrow((23, 45), (27.4, 45))
 
@@ -145,13 +144,12 @@ def _steps(sheet: Sheet, left: float, right: float, y: float, nfe: int) -> None:
 
 def _robot(sheet: Sheet, method: Method) -> None:
     sheet.box(2, 2, 124, 13, face=FACES["robot"])
-    names = {"socket": "socket peg insertion", "transfer": "object transfer"}
-    sheet.text(14, 10.6, "MuJoCo simulation", 22, size=9, weight="bold")
-    sheet.text(14, 6.6, names.get(method.task, method.task), 22, size=7.5)
+    sheet.text(14, 10.6, method.world, 22, size=9, weight="bold")
+    sheet.text(14, 6.6, read_mapping().task(method.task).title, 22, size=7.5)
     colors = [BLUE] * method.exec + [PALE] * (method.pred - method.exec)
     sheet.cells(45, 7.2, colors, width=68, height=3.4, edge=GREY)
     executed = 68 * method.exec / method.pred
-    sheet.text(45, 12.8, f"chunk of {method.pred} actions at 50 Hz", size=7.5, ha="left")
+    sheet.text(45, 12.8, f"chunk of {method.pred} actions at {method.control_hz:g} Hz", size=7.5, ha="left")
     done = f"the first {method.exec} are executed, the rest is dropped"
     if method.exec == method.pred:
         done = f"all {method.exec} are executed"

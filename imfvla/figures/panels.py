@@ -7,9 +7,34 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from imfvla.figures.style import CYCLE, GREY, MARKERS
+from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.results import Result
 
-TASKS = {"socket": "socket peg insertion", "transfer": "object transfer"}
 LINES = ("-", "--", ":", "-.")
+
+
+def tasks_of(results: Sequence[Result]) -> dict[str, str]:
+    """Title by task, a panel for each: the tasks that tables.yaml names, then the others of the results."""
+    mapping = read_mapping()
+    names = [task.name for task in mapping.tasks]
+    others = sorted({result.task for result in results if result.task is not None} - set(names))
+    return {name: mapping.task(name).title for name in (*names, *others)}
+
+
+def stages_of(task: str, results: Sequence[Result]) -> tuple[str, ...]:
+    """Names of a task's stages, as its evaluations or else tables.yaml have them; none where it has no stages.
+
+    None too where the episodes have stages of several tasks, as in a scene that serves more than one.
+    """
+    recorded = [
+        found.evaluation.summary["stages"]
+        for result in results
+        for found in result.evaluated
+        if "stages" in found.evaluation.summary
+    ]
+    names = tuple(recorded[0]) if recorded else read_mapping().task(task).stages or ()
+    counts = {len(row["first_step_of_stage"]) for result in results for row in result.episodes}
+    return names if counts <= {len(names)} else ()
 
 
 def say_nothing_yet(axes: Axes, text: str) -> None:

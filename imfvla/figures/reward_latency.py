@@ -1,4 +1,4 @@
-"""Figure 3: average reward on the socket task against the time of a chunk, with the Pareto frontier."""
+"""Average reward of a table's rows against the time of a chunk, with the Pareto frontier."""
 
 import re
 from collections.abc import Sequence

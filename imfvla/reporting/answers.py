@@ -112,15 +112,21 @@ class Sources:
         ]
 
 
-def check_equal_protocols(answers: Sequence[Answer]) -> None:
-    """Raises UserError where rows of one table were evaluated with different protocols."""
+def check_equal_protocols(answers: Sequence[Answer], task: str) -> None:
+    """Raises UserError where rows of one table were evaluated with different protocols, or another task than its."""
     every = [(answer.row, found) for answer in answers for found in answer.evaluated]
+    for row, one in every:
+        if (played := one.evaluation.summary["protocol"].get("task")) != task:
+            raise UserError(
+                f"{row.table} is of the task {task}, but {one.evaluation.folder} ({row.where}) played {played}: put "
+                "the row into a table of that task."
+            )
     for (row, one), (other_row, other) in pairwise(every):
         ours, theirs = one.evaluation.summary["protocol"], other.evaluation.summary["protocol"]
         for key in PROTOCOL:
             if ours.get(key) != theirs.get(key):
                 raise UserError(
-                    f"Table {row.table} mixes protocols: {key} is {ours.get(key)!r} in {one.evaluation.folder} "
+                    f"{row.table} mixes protocols: {key} is {ours.get(key)!r} in {one.evaluation.folder} "
                     f"({row.where}) and {theirs.get(key)!r} in {other.evaluation.folder} ({other_row.where}); "
                     "evaluate both with the same protocol."
                 )

@@ -6,26 +6,45 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import yaml
-
-from imfvla.documents import ChosenLoader, read_yaml
 from imfvla.errors import UserError
-from imfvla.options import build, require, suggestion
-from imfvla.reporting.paper import (
-    TABLES,
-    PaperComparison,
-    PaperRow,
-    paper_comparisons,
-    paper_rows,
-)
+from imfvla.options import Limit, build, one_of, require, suggestion
+from imfvla.reporting.mapping_file import entries, load, named, place_of, plain
+from imfvla.reporting.paper import PaperComparison, PaperRow, paper_comparisons, paper_numbers, paper_rows
 from imfvla.run_directory import LAST, step_of
 
 PATH = Path(__file__).resolve().parents[2] / "experiments" / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
-_LINE = "__line__"
+ROWS, COMPARISONS = "rows", "comparisons"
+FIGURES = ("reward_latency", "ablations")  # of a table's rows
+SECTIONS = ("evaluation", "tasks", "tables")
+PRINTED = Limit("the number of a table in experiments/paper", lambda number: number in paper_numbers())
+
+
+@dataclass(frozen=True, slots=True)
+class TaskTitle:
+    """What figures call a task, and its stages where evaluations from before they were recorded do not say them."""
+
+    name: str
+    title: str
+    stages: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TableTitle:
+    """A table of rows of one task, or the table of comparisons between rows.
+
+    `printed` is its number in the paper, None where the paper has no such table; `figure` draws its rows.
+    """
+
+    name: str
+    title: str
+    of: Annotated[str, one_of(ROWS, COMPARISONS)] = ROWS
+    task: str | None = None
+    printed: Annotated[int, PRINTED] | None = None
+    figure: Annotated[str, one_of(*FIGURES)] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +59,10 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class TableRow:
-    """A row of Table 1 or 2. `paper` is the printed row, None for a rival that the paper does not have."""
+    """A row of a table. `paper` is the printed row, None for a row that the paper does not have."""
 
     name: str
-    table: int
+    table: str  # name of its table
     experiment: str  # of conf/exp
     overrides: tuple[str, ...]
     nfe: int
@@ -70,7 +89,7 @@ class TableRow:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A row of Table 3: `of` of a row against that of its baseline, as one of OPERATIONS."""
+    """A row of the comparisons: `of` of a row against that of its baseline, as one of OPERATIONS."""
 
     row: TableRow
     baseline: TableRow
@@ -81,13 +100,26 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """The rows of Tables 1 and 2 and the comparisons of Table 3, each in its order."""
+    """All tables, their rows and the comparisons, each in its order; `tasks` are those that figures always show."""
 
+    tasks: tuple[TaskTitle, ...]
+    tables: tuple[TableTitle, ...]
     rows: tuple[TableRow, ...]
     comparisons: tuple[Comparison, ...]
 
-    def of_table(self, table: int) -> tuple[TableRow, ...]:
-        return tuple(row for row in self.rows if row.table == table)
+    @property
+    def of_rows(self) -> tuple[TableTitle, ...]:
+        return tuple(table for table in self.tables if table.of == ROWS)
+
+    def table(self, name: str) -> TableTitle:
+        return next(table for table in self.tables if table.name == name)
+
+    def task(self, name: str) -> TaskTitle:
+        """Its title is its name where the file has none."""
+        return next((task for task in self.tasks if task.name == name), TaskTitle(name, name))
+
+    def of_table(self, name: str) -> tuple[TableRow, ...]:
+        return tuple(row for row in self.rows if row.table == name)
 
     def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
         """The first row of an experiment, a `run_key` and an NFE, whatever its checkpoint."""
@@ -125,39 +157,78 @@ def run_key(directory: str) -> str:
 @cache
 def read_mapping(path: Path = PATH) -> Mapping:
     """The mapping of a file. Raises UserError naming file, line and row for anything invalid."""
-    content = _load(path)
-    known = {"evaluation", *(f"table{number}" for number in (*TABLES, 3))}
-    for key in content:
-        if key not in known:
-            raise UserError(
-                f"Unknown key {key}{suggestion(key, known)} in {path}; known are {', '.join(sorted(known))}."
-            )
-    missing = sorted(known - content.keys())
-    if missing:
-        raise UserError(f"{path} lacks {', '.join(missing)}.")
-    evaluation = _plain(content["evaluation"], f"{path}: evaluation")
+    content = load(path)
+    _check_keys(content, path)
+    tasks = _titles(content, "tasks", TaskTitle, path)
+    tables = _titles(content, "tables", TableTitle, path)
+    _check_tables(tables, tasks, path)
+    evaluation = plain(content["evaluation"], f"{path}: evaluation")
     wanted = build(Wanted, evaluation, f"{path}: evaluation")
     rows = [
         _row(entry, table, number, path, wanted)
-        for table in TABLES
-        for number, entry in enumerate(_entries(content, f"table{table}", path), 1)
+        for table in tables
+        if table.of == ROWS
+        for number, entry in enumerate(entries(content, table.name, path), 1)
     ]
-    _check_rows(rows, path)
-    names = {row.name: row for row in rows}
-    comparisons = [
-        _comparison(entry, number, path, names)
-        for number, entry in enumerate(_entries(content, "table3", path), 1)
-    ]
-    _check_each_once([c.paper.label for c in comparisons], [p.label for p in paper_comparisons()], 3, path)
-    return Mapping(tuple(rows), tuple(comparisons))
+    _check_rows(rows, tables, path)
+    by_name = {row.name: row for row in rows}
+    comparisons = []
+    for table in tables:
+        if table.of == COMPARISONS:
+            found = [
+                _comparison(entry, table, number, path, by_name)
+                for number, entry in enumerate(entries(content, table.name, path), 1)
+            ]
+            printed = [comparison.label for comparison in paper_comparisons(table.printed)]
+            _check_each_once([c.paper.label for c in found], printed, table, path)
+            comparisons += found
+    return Mapping(tasks, tables, tuple(rows), tuple(comparisons))
 
 
-def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wanted) -> TableRow:
-    where = _where(entry, f"table{table}, row {number}", path)
-    values = _plain(entry, where)
+def _titles(content: dict[str, Any], key: str, cls: type, path: Path) -> tuple[Any, ...]:
+    """The entries of a section, each with the name that it has there."""
+    return tuple(
+        build(
+            cls,
+            {"name": name, **plain(entry, f"{path}: {key}.{name}")},
+            place_of(entry, f"{key}.{name}", path),
+        )
+        for name, entry in plain(content[key], f"{path}: {key}").items()
+    )
+
+
+def _check_keys(content: dict[str, Any], path: Path) -> None:
+    tables = content.get("tables", {})
+    known = {*SECTIONS, *(plain(tables, f"{path}: tables"))}
+    for key in content:
+        if key not in known:
+            raise UserError(
+                f"Unknown key {key}{suggestion(key, known)} in {path}; known are {', '.join(sorted(known))}: a table's "
+                "rows have the name of one under tables."
+            )
+    if missing := sorted(known - content.keys()):
+        raise UserError(f"{path} lacks {', '.join(missing)}.")
+
+
+def _check_tables(tables: Sequence[TableTitle], tasks: Sequence[TaskTitle], path: Path) -> None:
+    known = {task.name: task for task in tasks}
+    for table in tables:
+        where = f"{path}: tables.{table.name}"
+        if table.of == ROWS:
+            require(table.task is not None, f"{where}.task", f"one of {', '.join(known)}", table.task)
+            named(table.task, known, f"{where}: unknown task")
+        else:
+            require(table.printed is not None, f"{where}.printed", "given: comparisons are the paper's", None)
+    compared = [table.name for table in tables if table.of == COMPARISONS]
+    require(len(compared) <= 1, f"{path}: tables", "at most one of comparisons", compared)
+
+
+def _row(entry: dict[str, Any], table: TableTitle, number: int, path: Path, default: Wanted) -> TableRow:
+    where = place_of(entry, f"{table.name}, row {number}", path)
+    values = plain(entry, where)
     wanted = replace(default)
     if "evaluation" in values:
-        changes = _plain(values.pop("evaluation"), f"{where}: evaluation")
+        changes = plain(values.pop("evaluation"), f"{where}: evaluation")
         base = {name: getattr(default, name) for name in Wanted.__slots__}
         wanted = build(Wanted, base | changes, f"{where}: evaluation")
     read = build(_RowEntry, values, where)
@@ -167,13 +238,13 @@ def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wa
     if read.paper is not None:
         if read.method is not None or read.setting is not None:
             raise UserError(f"{where} has both paper and method or setting: give one or the other.")
-        labels = {row.label: row for row in paper_rows() if row.table == table}
-        paper = _named(read.paper, labels, f"{where}: unknown row of the paper's Table {table}")
+        labels = {} if table.printed is None else {row.label: row for row in paper_rows(table.printed)}
+        paper = named(read.paper, labels, f"{where}: unknown row of the paper's Table {table.printed}")
     elif read.method is None or read.setting is None:
         raise UserError(f"{where} must have paper, or method and setting, to say what the row is.")
     return TableRow(
         name=read.name,
-        table=table,
+        table=table.name,
         experiment=read.experiment,
         overrides=read.overrides,
         nfe=read.nfe,
@@ -186,41 +257,44 @@ def _row(entry: dict[str, Any], table: int, number: int, path: Path, default: Wa
     )
 
 
-def _comparison(entry: dict[str, Any], number: int, path: Path, rows: dict[str, TableRow]) -> Comparison:
-    where = _where(entry, f"table3, row {number}", path)
-    values = _plain(entry, where)
+def _comparison(
+    entry: dict[str, Any], table: TableTitle, number: int, path: Path, rows: dict[str, TableRow]
+) -> Comparison:
+    where = place_of(entry, f"{table.name}, row {number}", path)
+    values = plain(entry, where)
     if "as" in values:  # a keyword in Python
         values["operation"] = values.pop("as")
     read = build(_ComparisonEntry, values, where)
     require(read.operation in OPERATIONS, f"{where}: as", " or ".join(OPERATIONS), read.operation)
     require(read.of in COMPARED, f"{where}: of", " or ".join(COMPARED), read.of)
-    printed = {comparison.label: comparison for comparison in paper_comparisons()}
+    printed = {comparison.label: comparison for comparison in paper_comparisons(table.printed)}
     return Comparison(
-        row=_named(read.row, rows, f"{where}: unknown row"),
-        baseline=_named(read.baseline, rows, f"{where}: unknown row"),
+        row=named(read.row, rows, f"{where}: unknown row"),
+        baseline=named(read.baseline, rows, f"{where}: unknown row"),
         of=read.of,
         operation=read.operation,
-        paper=_named(read.paper, printed, f"{where}: unknown row of the paper's Table 3"),
+        paper=named(read.paper, printed, f"{where}: unknown row of the paper's Table {table.printed}"),
     )
 
 
-def _check_rows(rows: Sequence[TableRow], path: Path) -> None:
+def _check_rows(rows: Sequence[TableRow], tables: Sequence[TableTitle], path: Path) -> None:
     seen: dict[str, TableRow] = {}
     for row in rows:
         if row.name in seen:
             raise UserError(f"{row.where}: the name {row.name} is taken by {seen[row.name].where}.")
         seen[row.name] = row
-    for table in TABLES:
-        printed = [paper.label for paper in paper_rows() if paper.table == table]
-        found = [row.paper.label for row in rows if row.paper and row.table == table]
-        _check_each_once(found, printed, table, path)
+    for table in tables:
+        if table.of == ROWS and table.printed is not None:
+            printed = [paper.label for paper in paper_rows(table.printed)]
+            found = [row.paper.label for row in rows if row.paper and row.table == table.name]
+            _check_each_once(found, printed, table, path)
 
 
-def _check_each_once(found: Sequence[str], printed: Sequence[str], table: int, path: Path) -> None:
+def _check_each_once(found: Sequence[str], printed: Sequence[str], table: TableTitle, path: Path) -> None:
     for label in printed:
         if found.count(label) != 1:
             raise UserError(
-                f"{path}: table{table} must have the paper's row {label!r} once, found {found.count(label)}."
+                f"{path}: {table.name} must have the paper's row {label!r} once, found {found.count(label)}."
             )
 
 
@@ -232,49 +306,3 @@ def _check_checkpoint(checkpoint: str, where: str) -> None:
         "last or a share such as 1/3",
         checkpoint,
     )
-
-
-def _named(name: str, known: dict[str, Any], problem: str) -> Any:
-    if name not in known:
-        raise UserError(f"{problem} {name!r}{suggestion(name, known)}; known are {', '.join(known)}.")
-    return known[name]
-
-
-def _where(entry: Any, what: str, path: Path) -> str:
-    line = entry.get(_LINE) if isinstance(entry, dict) else None
-    return f"{path}, line {line}, {what}" if line else f"{path}, {what}"
-
-
-def _plain(entry: Any, where: str) -> dict[str, Any]:
-    if not isinstance(entry, dict):
-        raise UserError(f"{where} must be a mapping of keys to values, found {entry!r}.")
-    return {key: value for key, value in entry.items() if key != _LINE}
-
-
-def _entries(content: dict[str, Any], key: str, path: Path) -> list[Any]:
-    if not isinstance(content[key], list):
-        raise UserError(f"{path}: {key} must be a list of rows, found {content[key]!r}.")
-    return content[key]
-
-
-class _Loader(ChosenLoader):
-    """Notes for each mapping the line where it begins, and refuses a key that is given twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        line = node.start_mark.line + 1
-        keys = [key.value for key, _ in node.value]
-        twice = next((key for key in keys if keys.count(key) > 1), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"line {line} has {twice} twice", None)
-        return super().construct_mapping(node, deep=True) | {_LINE: line}
-
-
-_Loader.add_constructor("tag:yaml.org,2002:map", lambda loader, node: loader.construct_mapping(node))
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = read_yaml(path, _Loader)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
-    return _plain(content, str(path))

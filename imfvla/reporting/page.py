@@ -19,6 +19,7 @@ RUN_FILES = ("config.yaml", "metrics.jsonl", "made_by.json", "train.log")
 EVALUATION_FILES = ("episodes.jsonl", "summary.json")
 STYLE, SCRIPT = (Path(__file__).with_suffix(suffix) for suffix in (".css", ".js"))
 ROLLOUTS = "Rollouts"
+STAGES = "first step of each stage"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,9 +149,11 @@ def _episodes(episodes: Sequence[Row]) -> str:
         "return",
         "highest reward",
         "success-like",
-        "first step of each stage",
+        STAGES,
         "failure",
     )
+    has_stages = any(row["first_step_of_stage"] for row in episodes)
+    names = [name for name in names if has_stages or name != STAGES]
     heads = "".join(f'<th class="number">{name}</th>' for name in names)
     lines = []
     for row in episodes:
@@ -160,13 +163,19 @@ def _episodes(episodes: Sequence[Row]) -> str:
             f"{row['total_reward']:g}",
             f"{row['max_reward']:g}",
             "yes" if row["success"] else "no",
-            " ".join("-" if step < 0 else str(step) for step in row["first_step_of_stage"]),
+            *_stages(row, has_stages),
             row["failure"] or "-",
         )
         filled = "".join(f'<td class="number">{escape(str(cell))}</td>' for cell in cells)
         lines.append(f"<tr>{filled}</tr>")
     table = f"<table><thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return f'<details><summary>{len(episodes)} episodes</summary><div class="scroll">{table}</div></details>'
+
+
+def _stages(row: Row, has_stages: bool) -> list[str]:
+    """The cell of the stages, where there are any."""
+    steps = ["-" if step < 0 else str(step) for step in row["first_step_of_stage"]]
+    return [" ".join(steps)] if has_stages else []
 
 
 def _anchor(name: str) -> str:

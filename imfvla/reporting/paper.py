@@ -1,24 +1,19 @@
 """The paper's printed tables, from `experiments/paper`. `mapping.py` says which run fills a row."""
 
 import csv
+import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 DIRECTORY = Path(__file__).resolve().parents[2] / "experiments" / "paper"
-TABLES = (1, 2)  # rows of methods; table 3 compares them
-TITLES = {
-    1: "Table 1: socket peg insertion",
-    2: "Table 2: object transfer",
-    3: "Table 3: derived comparisons",
-}
 
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One printed row of Table 1 or 2."""
+    """One printed row of a table of methods."""
 
-    table: int
+    table: int  # its number in the paper
     method: str
     setting: str
     avg_reward: float
@@ -27,8 +22,8 @@ class PaperRow:
     nonzero: int
     success: int
     episodes: int
-    latency_ms: float | None  # printed in Table 1 only
-    inference_fps: float | None  # printed in Table 2 only
+    latency_ms: float | None  # None where the table does not print it
+    inference_fps: float | None  # None where the table does not print it
 
     @property
     def label(self) -> str:
@@ -38,7 +33,7 @@ class PaperRow:
 
 @dataclass(frozen=True, slots=True)
 class PaperComparison:
-    """One printed row of Table 3; `result` is the text as printed."""
+    """One printed comparison of two rows; `result` is the text as printed."""
 
     comparison: str
     metric: str
@@ -46,20 +41,27 @@ class PaperComparison:
 
     @property
     def label(self) -> str:
-        """Unique within Table 3."""
+        """Unique within its table."""
         return f"{self.comparison}, {self.metric}"
 
 
 @cache
-def paper_rows() -> tuple[PaperRow, ...]:
-    """The rows of Tables 1 and 2 in the paper's order."""
-    return tuple(_row(table, line) for table in TABLES for line in _lines(table))
+def paper_numbers() -> tuple[int, ...]:
+    """The numbers of the printed tables that there are."""
+    found = (re.fullmatch(r"table(\d+)", path.stem) for path in DIRECTORY.glob("*.csv"))
+    return tuple(sorted(int(match.group(1)) for match in found if match))
 
 
 @cache
-def paper_comparisons() -> tuple[PaperComparison, ...]:
-    """The rows of Table 3 in the paper's order."""
-    return tuple(PaperComparison(**line) for line in _lines(3))
+def paper_rows(table: int) -> tuple[PaperRow, ...]:
+    """The rows of a printed table of methods, in the paper's order."""
+    return tuple(_row(table, line) for line in _lines(table))
+
+
+@cache
+def paper_comparisons(table: int) -> tuple[PaperComparison, ...]:
+    """The rows of a printed table of comparisons, in the paper's order."""
+    return tuple(PaperComparison(**line) for line in _lines(table))
 
 
 def _lines(table: int) -> list[dict[str, str]]:

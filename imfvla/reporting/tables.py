@@ -1,4 +1,4 @@
-"""Tables 1 to 3, ours beside the paper's printed values, and the rows of ours that the paper does not have."""
+"""The tables, ours beside the paper's printed values, and the evaluations that are in none of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from imfvla.reporting.comparisons import Compared
 from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.notes import detectable_success, pairing
-from imfvla.reporting.paper import TITLES, PaperRow
+from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, REFUSED, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
@@ -64,8 +64,8 @@ class Document:
     data: Table
 
 
-def paper_table(number: int, results: Sequence[Result], notes: Sequence[str] = ()) -> Document:
-    """Table 1 or 2: under each printed row ours, then the rivals that the paper does not have."""
+def row_table(title: str, results: Sequence[Result], notes: Sequence[str] = ()) -> Document:
+    """A table of rows: ours under each row that the paper prints, and those that the paper does not have."""
     cells, keys = [], []
     for result in results:
         if result.paper:
@@ -78,8 +78,8 @@ def paper_table(number: int, results: Sequence[Result], notes: Sequence[str] = (
     described = (_described(results), detectable_success(len(first[0]))) if first else ()
     every = (*described, INTERVALS, *notes)
     return Document(
-        Table(TITLES[number], COLUMNS, tuple(cells), every, tuple(keys), missing),
-        Table(TITLES[number], *_data(results)),
+        Table(title, COLUMNS, tuple(cells), every, tuple(keys), missing),
+        Table(title, *_data(results)),
     )
 
 
@@ -93,8 +93,8 @@ def other_table(results: Sequence[Result]) -> Document:
     return Document(Table(title, columns, cells, notes, keys), Table(title, *_data(results)))
 
 
-def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) -> Document:
-    """Table 3: every ratio of the paper from our rows."""
+def comparison_table(title: str, compared: Sequence[Compared], notes: Sequence[str] = ()) -> Document:
+    """Every ratio that the paper prints, from our rows."""
     cells = []
     for found in compared:
         paper = found.comparison.paper
@@ -118,8 +118,8 @@ def comparison_table(compared: Sequence[Compared], notes: Sequence[str] = ()) ->
     )
     columns = ("Comparison", "Metric", "Paper", "Ours", "p", "p (Holm)")
     keys = tuple((found.row.name, found.baseline.name) for found in compared)
-    table = Table(TITLES[3], columns, tuple(cells), (*notes, *refused), keys, tuple(commands.items()))
-    return Document(table, Table(TITLES[3], *_comparison_data(compared)))
+    table = Table(title, columns, tuple(cells), (*notes, *refused), keys, tuple(commands.items()))
+    return Document(table, Table(title, *_comparison_data(compared)))
 
 
 def printed(paper: PaperRow) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ from imfvla.episode import EpisodeInfo
 from imfvla.errors import UserError
 from imfvla.options import Limit, build
 from imfvla.recording import EpisodeIndex, Recordings, read_episode, read_index
-from imfvla.robot import RobotSpec
 from imfvla.same_robot import refuse_other_robot
 from imfvla.sources.base import EpisodeArrays
 
@@ -37,7 +36,7 @@ class McapSource:
 
     def __init__(self, recordings: Recordings) -> None:
         self.recordings = recordings
-        self.robot = robot_of_recording(self._index(0).info)
+        self.robot = self._index(0).info.robot
 
     @classmethod
     def of(cls, directory: str | Path) -> "McapSource":
@@ -53,7 +52,7 @@ class McapSource:
         first, path = self.recordings.files[0], episode.path
         refuse_other_robot(
             self.robot,
-            robot_of_recording(episode.info),
+            episode.info.robot,
             views,
             of=f"recording {first}",
             where=f"Recording {path}",
@@ -89,16 +88,6 @@ class McapSource:
     @cached_property
     def _indices(self) -> dict[int, EpisodeIndex]:
         return {}
-
-
-def robot_of_recording(info: EpisodeInfo) -> RobotSpec:
-    """The robot that a recording states; those from before they stated it are of the two arms."""
-    stated = getattr(info, "robot", None)
-    if stated is not None:
-        return stated
-    from imfvla.tasks.bimanual_robot import bimanual_robot  # here, as only old recordings need it
-
-    return bimanual_robot(info.views, info.image_size)
 
 
 def _paraphrases(info: EpisodeInfo) -> Sequence[str]:

@@ -15,7 +15,7 @@ SHARED = (
 )  # keys of `demos` that every kind has, and that its module is not given
 
 
-def kind_of(config: Mapping[str, Any]) -> str:
+def source_kind(config: Mapping[str, Any]) -> str:
     """Which source `demos.source` names; configs from before that key are of the scripted expert."""
     kind = part_of(config, "demos").get("source", SCRIPTED)
     allowed = one_of(*KINDS)
@@ -29,7 +29,7 @@ def open_source(config: Mapping[str, Any]) -> EpisodeSource:
     The scripted expert records missing demonstrations first. Raises UserError where options are wrong or files are
     missing or damaged.
     """
-    kind = kind_of(config)
+    kind = source_kind(config)
     if kind == SCRIPTED:
         # Imported here: a data set needs no simulator.
         from imfvla.sources.scripted import open_source as open_scripted

@@ -13,7 +13,7 @@ from imfvla.robot_of import robot_of
 from imfvla.same_robot import refuse_other_data
 from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
-from imfvla.sources.opening import kind_of
+from imfvla.sources.opening import source_kind
 
 STORES = Path("data/frames")  # of sources that are no folder of recordings
 DIGITS = 12  # of a source's digest in the name of its store
@@ -54,7 +54,7 @@ def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> Non
         source.robot,
         config["observation"]["views"],
         of="the task",
-        where=f"The data of demos.source={kind_of(config)}",
+        where=f"The data of demos.source={source_kind(config)}",
         remedy="Choose data or a task of the same robot.",
     )
 
@@ -66,7 +66,7 @@ def store_path(config: Mapping[str, Any], source: EpisodeSource) -> Path:
     if isinstance(source, McapSource):
         directory, name = source.recordings.directory.parent, source.recordings.name
     else:
-        directory, name = STORES, f"{kind_of(config)}-{source.digest()[:DIGITS]}"
+        directory, name = STORES, f"{source_kind(config)}-{source.digest()[:DIGITS]}"
     return Path(chosen or directory) / f"{name}_frames_{height}x{width}"
 
 

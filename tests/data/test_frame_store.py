@@ -104,7 +104,7 @@ def test_a_damaged_recording_is_named_and_the_store_stays(synthetic_demonstratio
 
 def test_an_action_that_is_not_finite_is_named(tmp_path, monkeypatch):
     actions = np.full((6, 16), np.nan, np.float32)
-    monkeypatch.setattr("synthetic.synthetic_actions", lambda seed, num_steps: actions)
+    monkeypatch.setattr("synthetic.synthetic_actions", lambda seed, num_steps, robot: actions)
     monkeypatch.setattr("synthetic.StillScene.look", lambda self: {"top": np.zeros((32, 32, 3), np.uint8)})
     write_demonstrations(tmp_path / "demonstrations", num_episodes=1, num_steps=6)
     with pytest.raises(

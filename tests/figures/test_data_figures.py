@@ -8,7 +8,7 @@ from seen import clipped, texts
 from synthetic_runs import answer_row, episodes_of, make_run, write_evaluation
 
 from imfvla.errors import UserError
-from imfvla.figures.ablations import transfer_ablations
+from imfvla.figures.ablations import ablations
 from imfvla.figures.depth_attention import FILE, depth_attention, read_depth_attention
 from imfvla.figures.evaluations import success_by_evaluations
 from imfvla.figures.failures import failed_stages, first_failed_stage
@@ -22,7 +22,7 @@ from imfvla.reporting.results import Result
 
 MAPPING = read_mapping()
 MISSING = ("socket_smolvla", "transfer_dit_ph08_exec08", "socket_l1")
-FIGURES = [reward_latency, transfer_ablations, success_by_evaluations, learning_curves, failed_stages]
+FIGURES = [reward_latency, ablations, success_by_evaluations, learning_curves, failed_stages]
 
 
 def results_of(*directories) -> list[Result]:
@@ -41,19 +41,19 @@ def results(tmp_path_factory) -> list[Result]:
     return results_of(root)
 
 
-def of_table(results, table: int) -> list[Result]:
+def of_table(results, table: str) -> list[Result]:
     return [result for result in results if result.row.table == table]
 
 
 @pytest.mark.parametrize("draw", FIGURES)
 def test_no_text_is_cut_off_whether_there_are_results_or_none(draw, results, tmp_path):
     for found in (results, results_of(tmp_path)):
-        table = {reward_latency: 1, transfer_ablations: 2}.get(draw)
+        table = {reward_latency: "table1", ablations: "table2"}.get(draw)
         assert not clipped(draw(of_table(found, table) if table else found))
 
 
 def test_a_missing_row_is_marked_and_has_no_bar(results):
-    figure = transfer_ablations(of_table(results, 2))
+    figure = ablations(of_table(results, "table2"))
     assert texts(figure).count("missing") == 2  # in both panels
     lengths = [[bar.get_width() for bar in axes.containers[-1]] for axes in figure.axes]
     assert all(np.isnan(panel[8]) and np.isfinite(np.delete(panel, 8)).all() for panel in lengths)
@@ -65,7 +65,7 @@ def test_the_frontier_is_what_nothing_beats_in_both():
 
 
 def test_printed_values_and_ours_are_in_panels_of_their_own(results):
-    paper, ours = reward_latency(of_table(results, 1)).axes
+    paper, ours = reward_latency(of_table(results, "table1")).axes
     assert len(paper.texts) == 7
     assert len(ours.texts) == 15
     assert "3" in [text.get_text() for text in paper.texts]
@@ -91,7 +91,7 @@ def test_a_bar_of_failures_ends_at_their_share(results):
 
 
 def test_results_of_a_method_are_grouped_under_its_name(results):
-    socket = failed_stages(of_table(results, 1)).axes[0]
+    socket = failed_stages(of_table(results, "table1")).axes[0]
     names = [label.get_text().replace("\N{FIGURE SPACE}", "") for label in socket.get_yticklabels()]
     first = names.index("Flow, high-noise times   NFE 1")
     assert [name.strip() for name in names[first + 1 : first + 3]] == ["NFE 2", "NFE 10"]
@@ -100,7 +100,7 @@ def test_results_of_a_method_are_grouped_under_its_name(results):
 
 
 def test_weights_at_the_end_of_training_are_compared_over_nfe(results):
-    panels = success_by_evaluations(of_table(results, 1)).axes
+    panels = success_by_evaluations(of_table(results, "table1")).axes
     lines = {
         axes.get_title(loc="left"): [len(bars.lines[0].get_xdata()) for bars in axes.containers]
         for axes in panels

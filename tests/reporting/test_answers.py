@@ -123,11 +123,11 @@ def test_tables_do_not_mix_protocols(tmp_path):
     answer_row(tmp_path, ROWS["socket_infer2"])
     answer_row(tmp_path, ROWS["socket_act"], variant="hard")
     sources = Sources([tmp_path])
-    answers = [sources.answer(row, MAPPING) for row in MAPPING.of_table(1)]
+    answers = [sources.answer(row, MAPPING) for row in MAPPING.of_table("table1")]
     with pytest.raises(
-        UserError, match=r"Table 1 mixes protocols: variant is 'default' in .* row 4\) and 'hard'"
+        UserError, match=r"table1 mixes protocols: variant is 'default' in .* row 4\) and 'hard'"
     ):
-        check_equal_protocols(answers)
+        check_equal_protocols(answers, "socket")
 
 
 def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):

@@ -16,7 +16,7 @@ from imfvla.reporting.media import Media
 from imfvla.reporting.page import Picture, page
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import Table
-from imfvla.reporting.tables import paper_table
+from imfvla.reporting.tables import row_table
 
 MAPPING = read_mapping()
 VOID = {"meta", "img", "br", "link"}
@@ -65,8 +65,8 @@ def run(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def reader(run) -> Reader:
     sources = Sources([run / "runs"])
-    results = [Result.of(sources.answer(row, MAPPING)) for row in MAPPING.of_table(1)]
-    table = paper_table(1, results).shown
+    results = [Result.of(sources.answer(row, MAPPING)) for row in MAPPING.of_table("table1")]
+    table = row_table("Table 1: socket peg insertion", results).shown
     return Reader(
         page(
             [table],
@@ -92,7 +92,7 @@ def test_every_link_leads_somewhere(reader, run):
 
 def test_each_row_of_ours_is_one_link_away_from_its_episodes(reader):
     targets = [link for link in reader.all("a", "href") if link.startswith("#row-")]
-    assert targets == [f"#row-{row.name}" for row in MAPPING.of_table(1)]
+    assert targets == [f"#row-{row.name}" for row in MAPPING.of_table("table1")]
     text = " ".join(reader.texts)
     for seed in (100_000, 100_099):
         assert f"{seed}" in text
@@ -125,7 +125,7 @@ def test_names_from_files_are_text_not_markup(run):
     found["fingerprint"]["machine"]["cpu"] = "<b>fast</b> & cheap"
     summary.write_text(json.dumps(found))
     sources = Sources([run / "runs"])
-    results = [Result.of(sources.answer(row, MAPPING)) for row in MAPPING.of_table(1)]
+    results = [Result.of(sources.answer(row, MAPPING)) for row in MAPPING.of_table("table1")]
     table = Table("A <table>", ("a",), (("<i>",),), notes=("1 < 2",))
     reader = Reader(page([table], [], results, Media(run, is_copied=False)))
     assert not [tag for tag, _ in reader.tags if tag in ("b", "i")]

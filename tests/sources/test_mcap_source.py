@@ -1,7 +1,5 @@
 """Recordings as a source of episodes, and which source a config opens."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, write_demonstrations, write_episode
@@ -46,8 +44,8 @@ def test_recordings_of_different_robots_are_not_mixed(synthetic_demonstrations):
 def test_a_config_opens_what_its_source_says(synthetic_demonstrations):
     config = compose("train", ["task=none", "demos=mcap", f"demos.directory={synthetic_demonstrations}"])
     assert isinstance(opening.open_source(config), McapSource)
-    assert opening.kind_of(config) == "mcap"
-    assert opening.kind_of({"demos": {"episodes": 1}}) == "scripted"  # as configs from before the key
+    assert opening.source_kind(config) == "mcap"
+    assert opening.source_kind({"demos": {"episodes": 1}}) == "scripted"  # as configs from before the key
 
 
 def test_an_unknown_source_or_option_is_named(synthetic_demonstrations):
@@ -70,14 +68,3 @@ def test_paraphrases_that_are_no_texts_are_refused(tmp_path, monkeypatch):
     source = McapSource.of(write_demonstrations(tmp_path / "demos", num_episodes=1))
     with pytest.raises(UserError, match="paraphrases must be a list of texts"):
         source.episode(0)
-
-
-def test_a_recording_may_state_its_robot(synthetic_demonstrations):
-    info = McapSource.of(synthetic_demonstrations)._index(0).info
-    stated = replace(bimanual_robot(VIEWS, (32, 32)), control_hz=20.0)
-
-    class Stating:
-        robot = stated
-
-    assert mcap.robot_of_recording(Stating()) == stated
-    assert mcap.robot_of_recording(info).control_hz == 50
