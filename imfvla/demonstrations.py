@@ -11,6 +11,7 @@ from imfvla.environments import GYMNASIUM, environment_of, kind_of
 from imfvla.episode import Actor
 from imfvla.errors import UserError
 from imfvla.options import build, part_of, require
+from imfvla.run_directory import flatten
 from imfvla.views import ViewOptions
 
 
@@ -112,7 +113,7 @@ class GymnasiumSettings:
         return "-".join([self.task, *dict.fromkeys(f"{height}x{width}" for height, width in self.sizes)])
 
     def to_json(self) -> dict[str, Any]:
-        return {"camera_every": self.camera_every, **json.loads(self.definition)}
+        return {"camera_every": self.camera_every, **flatten(json.loads(self.definition))}
 
     def build(self) -> tuple[Environment, Actor]:
         from imfvla.gymnasium_env.experts import make_expert  # here, since it needs an extra
@@ -160,15 +161,8 @@ def _gymnasium_settings(
         views=read.views,
         sizes=tuple((camera.height, camera.width) for camera in cameras),
         camera_every=camera_every,
-        # Which of its sentences a training draws changes no recording.
-        definition=json.dumps(
-            {
-                "task": {key: value for key, value in task.items() if key != "paraphrases"}
-                | {"paraphrases": False},
-                "observation": seen,
-            },
-            sort_keys=True,
-        ),
+        # Whether a training draws among its sentences changes no recording.
+        definition=json.dumps({"task": {**task, "paraphrases": False}, "observation": seen}),
     )
 
 

@@ -125,9 +125,9 @@ def _stages(values: Any) -> dict[str, float]:
         name: convert(value, float, f"task.stages.{name}")
         for name, value in _mapping(values, "task.stages").items()
     }
-    rising = list(stages.values())
-    require(rising == sorted(set(rising)), "task.stages", "rewards that rise from stage to stage", rising)
-    return stages
+    rewards = list(stages.values())
+    require(len(set(rewards)) == len(rewards), "task.stages", "rewards that all differ", rewards)
+    return dict(sorted(stages.items(), key=lambda stage: stage[1]))
 
 
 def _texts(values: Any, key: str) -> dict[str, str]:
