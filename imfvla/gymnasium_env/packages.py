@@ -14,6 +14,7 @@ from imfvla.errors import UserError
 
 GROUPS = ("imfvla.components", "gymnasium.envs")
 INSTALL = "pip install -c constraints.txt -e '.[gym]'"
+INSTALL_PUSHT = "pip install --no-deps gym-pusht==0.1.8"  # the extra has what else it needs
 # module -> the module here that adapts its environments
 ADAPTERS = {"gym_aloha": "imfvla.gymnasium_env.aloha", "gym_pusht": "imfvla.gymnasium_env.pusht"}
 
@@ -61,7 +62,8 @@ def register(package: str | None) -> None:
         import_module(package)
     except ImportError as error:
         raise UserError(
-            f"task.package={package} cannot be imported ({error}): run `{INSTALL}`, or see README.md."
+            f"task.package={package} cannot be imported ({error}): run `{INSTALL}`, for gym_pusht also "
+            f"`{INSTALL_PUSHT}`."
         ) from error
 
 
