@@ -66,6 +66,18 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
             _train(config, run, training, optim, processes)
 
 
+def _refuse_other_robot(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Raises UserError where the run in this directory is of another robot, which its data may have brought."""
+    refuse_other_robot(
+        robot_of(run.config()),
+        robot_of(config),
+        config["observation"]["views"],
+        of=f"the run in {run.path}",
+        where="The task or its data",
+        remedy="Choose another name=... for it.",
+    )
+
+
 def _check_environment(config: Mapping[str, Any]) -> None:
     """Raises UserError where nothing can be drawn, or where the environment has another robot than it states."""
     if kind_of(config["task"]) == BIMANUAL:
@@ -107,6 +119,7 @@ def _run_stages(
     """All stages, except the other processes' shares of training."""
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
+        _refuse_other_robot(config, run)
         try:
             is_trained = training.steps in run.weight_steps()
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)

@@ -51,16 +51,20 @@ class Policy(nn.Module):
         """(Tp, A) of the noise that one prediction starts from."""
         return self.horizon.pred, len(self.robot.action)
 
-    def first_steps(self, steps: int) -> dict[str, int]:
-        """Of parameters that are not trained from the beginning of `steps` steps on, the first step, by name."""
-        if not hasattr(self.generator, "first_steps"):
+    @property
+    def has_stages(self) -> bool:
+        """Whether what is learned depends on the step: the generator has `span` and `begin_step`."""
+        return hasattr(self.generator, "begin_step")
+
+    def spans(self, steps: int) -> dict[str, tuple[float, float]]:
+        """Of parameters that do not learn in all of `steps` steps, the steps [first, end) in which they do, by name."""
+        if not self.has_stages:
             return {}
-        later = self.generator.first_steps(self.core, steps)
-        return {f"core.{name}": step for name, step in later.items()}
+        return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
 
     def begin_step(self, step: int, steps: int) -> None:
         """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
-        if hasattr(self.generator, "begin_step"):
+        if self.has_stages:
             self.generator.begin_step(self.core, step, steps)
 
     def targets(self, batch: Batch) -> Tensor:
@@ -147,7 +151,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         raise UserError(
             f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
             f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
-            f"core.velocity_head=true with generator=imf_staged or generator.v_from=head, "
+            f"core.velocity_head=true with generator=imf or generator=imf_plain generator.v_from=head, "
             "any other core with any other generator."
         )
     if policy.encoder.last_token != policy.core.last_token:

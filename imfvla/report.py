@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from imfvla.composition import compose
 from imfvla.entry import entry_point
 from imfvla.options import build
+from imfvla.robot_of import has_environment
 from imfvla.run_directory import RunDirectory
 
 
@@ -34,9 +35,15 @@ def main(config: dict[str, Any]) -> None:
     """Prints the rows of one run, or publishes the tables of all runs: Markdown, CSV, LaTeX, figures and a page."""
     options = build(ReportOptions, config, "")
     if config["run"]:
-        from imfvla.reporting.table_row import print_row
+        run = RunDirectory(config["run"])
+        if has_environment(run.config()):
+            from imfvla.reporting.table_row import print_row
 
-        print_row(RunDirectory(config["run"]))
+            print_row(run)
+        else:
+            from imfvla.reporting.offline import print_offline
+
+            print_offline(run)
         return
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.publication import publish

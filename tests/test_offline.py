@@ -1,6 +1,7 @@
 """Without an environment: errors that are known, their tables, and a run that ends with them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,6 +82,15 @@ def test_a_finished_run_is_only_read_and_other_held_out_episodes_are_another_run
     assert list(read_offline(run)["error"]) == [HOLD, NEAREST, "infer3"]
     with pytest.raises(UserError, match=r"another config: task\.held_out was 1, is 2"):
         run_experiment(settings(tmp_path, "task.held_out=2"), run)
+
+
+def test_data_of_another_robot_does_not_go_on_with_a_run(run, tmp_path, monkeypatch):
+    faster = MemorySource(replace(ROBOT, control_hz=20.0))
+    monkeypatch.setattr("imfvla.sources.mcap.open_source", lambda options, *, where: faster)
+    with pytest.raises(
+        UserError, match=r"its data has another robot than the run in .* must be 10, found 20"
+    ):
+        run_experiment(settings(tmp_path), run)
 
 
 def test_the_report_has_a_table_of_them(run, tmp_path):

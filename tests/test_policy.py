@@ -124,9 +124,9 @@ def test_what_a_generator_sees_behind_an_episode_s_end_is_the_held_action_not_th
     [
         ["generator=act"],
         ["core=act"],
-        ["core.velocity_head=true"],
-        ["generator.v_from=head"],
-        ["generator=imf_staged", "core.velocity_head=false"],
+        ["generator=flow_high_noise", "core.velocity_head=true"],
+        ["generator=imf_plain", "generator.v_from=head"],
+        ["generator=imf", "core.velocity_head=false"],
     ],
 )
 def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
@@ -139,7 +139,7 @@ def test_a_generator_and_a_core_that_do_not_fit_are_refused(groups):
 def test_an_encoder_and_a_core_that_do_not_fit_are_refused():
     message = r"^encoder imfvla\.encoders\..* core imfvla\.nn\..* wants the .* there: core=smolvla goes with"
     with pytest.raises(UserError, match=message):
-        build_policy(compose("train", ["core=smolvla"]))
+        build_policy(compose("train", ["core=smolvla", "generator=smolvla"]))
 
 
 def test_loss_is_a_pure_function_of_batch_and_generator():

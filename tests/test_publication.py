@@ -98,7 +98,7 @@ def test_tables_are_byte_for_byte_those_on_file(name, tables_of_synthetic_runs):
 
 def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrendered):
     publish([runs], tmp_path / "out", MAPPING, method).write()
-    folder = next(runs.glob("transfer_ph32_exec16/default/rollouts/*"))
+    folder = next(runs.glob("transfer_ph32_exec16/generator=imf_plain/rollouts/*"))
     rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
     line = next(
         line

@@ -145,18 +145,18 @@ def flipped(generator: Any) -> Any:
 
 GENERATORS: dict[str, Callable[[], Any]] = {
     "imf": lambda: shipped("imf"),
-    "imf, sign flipped": lambda: flipped(shipped("imf")),
-    "imf_staged": lambda: shipped("imf_staged"),
+    "imf_plain": lambda: shipped("imf_plain"),
+    "imf_plain, sign flipped": lambda: flipped(shipped("imf_plain")),
     "flow_high_noise": lambda: shipped("flow_high_noise"),
     "ddpm": lambda: shipped("ddpm"),
 }
 CASES = (  # generator, evaluations, whether it has to pass
     ("imf", 1, True),
-    ("imf_staged", 1, True),
+    ("imf_plain", 1, True),
     ("flow_high_noise", 100, True),
     ("ddpm", 100, True),
     ("flow_high_noise", 1, False),
-    ("imf, sign flipped", 1, False),
+    ("imf_plain, sign flipped", 1, False),
 )
 
 
@@ -184,14 +184,20 @@ def train(
 ) -> nn.Module:
     """The averaged weights of a core that `generator` has trained; calls `advance` after each step."""
     torch.manual_seed(seed)
+    staged = hasattr(generator, "span")
     core = PlaneCore(width, depth, velocity_head=generator.core_interface == "flow and v-head")
-    ema = Ema(core, 0.999)
-    optimiser = torch.optim.Adam(core.parameters(), RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    learned = dict(core.named_parameters())
+    spans = {name: generator.span(f"core.{name}", steps) if staged else (0, steps) for name in learned}
+    ema = Ema(core, 0.999, spans)
+    optimiser = torch.optim.Adam([{"params": [learned[name]], "span": span} for name, span in spans.items()])
     rng = torch.Generator().manual_seed(seed)
     valid = torch.ones(BATCH, 1, dtype=torch.bool)
     for step in range(steps):
-        if hasattr(generator, "begin_step"):
+        for group in optimiser.param_groups:
+            first, end = group["span"]
+            group["lr"] = RATE * (1 + math.cos(math.pi * (step - first) / (end - first))) / 2
+        ema.settle(step)
+        if staged:
             for learner in (core, ema.policy):
                 generator.begin_step(learner, step, steps)
         loss, _ = generator.loss(core, NoContext(), draw(BATCH, rng).unsqueeze(1), valid, rng)
@@ -199,7 +205,6 @@ def train(
         loss.mean().backward()
         nn.utils.clip_grad_norm_(core.parameters(), 1.0)
         optimiser.step()
-        schedule.step()
         ema.update(step)
         advance()
     return ema.policy

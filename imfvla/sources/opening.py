@@ -17,7 +17,9 @@ SHARED = (
 
 def source_kind(config: Mapping[str, Any]) -> str:
     """Which source `demos.source` names; configs from before that key are of the scripted expert."""
-    kind = part_of(config, "demos").get("source", SCRIPTED)
+    demos = part_of(config, "demos")
+    require(isinstance(demos, Mapping), "demos", "a mapping of keys to values", demos)
+    kind = demos.get("source", SCRIPTED)
     allowed = one_of(*KINDS)
     require(isinstance(kind, str) and allowed.holds(kind), "demos.source", allowed.wanted, kind)
     return kind

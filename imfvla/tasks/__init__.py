@@ -1,4 +1,4 @@
-"""RoboIMI's two bimanual tasks in dm_control, and both in one scene.
+"""RoboIMI's two bimanual tasks in dm_control, both in one scene, and two tasks on which averages fail.
 
 Importing this package has the GL backend picked before mujoco is imported, and does nothing else. Names, limits and the
 robot need no simulator; `load` imports it.

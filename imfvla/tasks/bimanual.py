@@ -101,6 +101,11 @@ class BimanualTask(composer.Task):
         """Names of the stages, in order."""
         return entry_of(self.goal).stages
 
+    @property
+    def failed(self) -> bool:
+        """Whether something has happened in this episode after which it is no success, whatever its stages."""
+        return False
+
     def begin(self, seed: int) -> np.random.RandomState:
         """What the start state of the episode `seed` is drawn from."""
         return np.random.RandomState(seed)
@@ -184,19 +189,25 @@ class BimanualTask(composer.Task):
 
     def holds(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether both fingers of one arm touch the prop."""
-        other = self._partners(contacts, name)
+        other = self.partners(contacts, name)
         return all(finger & other for finger in self._ids.fingers[side])
 
     def touches(self, contacts: np.ndarray, side: str, name: str) -> bool:
         """Whether any finger of one arm touches the prop."""
-        other = self._partners(contacts, name)
+        other = self.partners(contacts, name)
         return any(finger & other for finger in self._ids.fingers[side])
 
     def on_table(self, contacts: np.ndarray, name: str) -> bool:
         """Whether the prop touches the table."""
-        return self._ids.table in self._partners(contacts, name)
+        return self._ids.table in self.partners(contacts, name)
 
-    def _partners(self, contacts: np.ndarray, name: str) -> set[int]:
+    @property
+    def table(self) -> int:
+        """Geom of the table."""
+        return self._ids.table
+
+    def partners(self, contacts: np.ndarray, name: str) -> set[int]:
+        """Geoms that touch the prop."""
         mine = self._ids.geoms[name][contacts]
         return set(contacts[mine[:, ::-1]].tolist())
 
@@ -287,7 +298,7 @@ class BimanualEnvironment:
         self._highest = max(self._highest, stage)
         ended = timestep.last()
         diverged = ended and self._num_steps < TIME_LIMIT_STEPS
-        success = self._highest >= len(self.stages) and not diverged
+        success = self._highest >= len(self.stages) and not (diverged or self.task.failed)
         return Outcome(float(stage), stage, success, ended)
 
     def state(self) -> np.ndarray:

@@ -48,6 +48,30 @@ TASKS = {
         ),
         stages=("grasp", "lift", "both hold", "handed over"),
     ),
+    "either_arm": Entry(
+        task="either_arm.EitherArmTask",
+        expert="experts.either_arm.EitherArmExpert",
+        instruction="lift the bar with both arms and let either one keep it",
+        paraphrases=(
+            "raise the bar together and leave it to one arm",
+            "pick up the bar with both grippers and hand it over to either of them",
+            "lift the bar with both hands and let one of them go",
+            "one arm gives the bar and the other one takes it",
+        ),
+        stages=("grasp", "grasp both", "lift both", "one alone", "other away"),
+    ),
+    "gate": Entry(
+        task="gate.GateTask",
+        expert="experts.gate.GateExpert",
+        instruction="carry the bar past the post without touching it",
+        paraphrases=(
+            "bring the bar behind the post and do not touch the post",
+            "carry the orange bar around or over the post",
+            "pass the post with the bar in the right gripper",
+            "take the bar to the other side of the post",
+        ),
+        stages=("grasp", "lift", "at the post", "past the post"),
+    ),
     "combined": Entry(task="combined.CombinedTask", expert="experts.combined.CombinedExpert"),
 }
 NAMES = tuple(TASKS)

@@ -1,4 +1,4 @@
-"""The objects that are handled: a square bar and a square ring on a tab. Lengths in m, densities in kg / m^3."""
+"""The objects of the tasks: a square bar, a square ring on a tab, a post. Lengths in m, densities in kg / m^3."""
 
 import numpy as np
 from dm_control import composer, mjcf
@@ -12,6 +12,8 @@ FLARE = 0.011  # length of the lips that guide a peg into the mouth
 TAB_LENGTH = 0.07
 TAB_WIDTH = 0.024
 TAB_HEIGHT = 0.022
+POST_RADIUS, POST_HEIGHT = 0.007, 0.125
+FOOT_RADIUS, FOOT_HEIGHT, FOOT_DENSITY = 0.03, 0.01, 7800  # heavy enough that a grazed post stays up
 
 ORANGE = (0.95, 0.45, 0.05, 1.0)
 YELLOW = (0.98, 0.90, 0.10, 1.0)
@@ -95,3 +97,24 @@ class Socket(Prop):
             half = (FLARE / 2, thickness, width) if turn[0] else (FLARE / 2, width, thickness)
             self._box(f"lip_{side}", pos, half, MAGENTA, euler=(0, turn[1] * np.pi / 4, turn[0] * np.pi / 4))
         self.tab_centre = tab
+
+
+class Post(Prop):
+    """An upright post on a round foot, free to be knocked over. The frame lies on its axis where it stands."""
+
+    rest_height = 0.0
+
+    def _build(self, name: str) -> None:
+        super()._build(name)
+        for part, radius, low, high, density in (
+            ("foot", FOOT_RADIUS, 0.0, FOOT_HEIGHT, FOOT_DENSITY),
+            ("shaft", POST_RADIUS, FOOT_HEIGHT, POST_HEIGHT, _SOLID["density"]),
+        ):
+            self._root.worldbody.add(
+                "geom",
+                name=part,
+                pos=(0, 0, (low + high) / 2),
+                size=(radius, (high - low) / 2),
+                rgba=MAGENTA,
+                **(_SOLID | {"type": "cylinder", "density": density}),
+            )

@@ -144,8 +144,11 @@ def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
 
     Raises UserError where the weights do not fit the run's config, or were trained for another robot.
     """
-    path = run.policy_weights(step)
+    step = run.weights_step(step)
     policy = build_policy(run.config(), statistics=None)
+    if policy.has_stages:
+        policy.begin_step(step - 1, run.training_steps())  # the last one that these weights have learned from
+    path = run.policy_weights(step)
     _refuse_other_robot(policy, path)
     load_weights(policy, path)
     return policy.eval().requires_grad_(False)

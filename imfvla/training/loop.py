@@ -33,6 +33,7 @@ from imfvla.training.parallel import Alone
 from imfvla.training.precision import autocast, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.training.sharding import FULL, release, shard, whole
+from imfvla.training.spans import Span, Spans
 from imfvla.types import Batch
 
 PRECISIONS = ("fp32", "bf16")
@@ -43,7 +44,7 @@ log = logging.getLogger(__name__)
 class Trainable(Protocol):
     """What the loop asks of a policy, which is also an nn.Module."""
 
-    def first_steps(self, steps: int) -> dict[str, int]: ...
+    def spans(self, steps: int) -> Spans: ...
     def begin_step(self, step: int, steps: int) -> None: ...
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
 
@@ -84,12 +85,12 @@ class Trainer:
         self.batches, self.run, self.options, self.optim = batches, run, options, optim
         self.seed, self.description = seed, dict(description)
         self.processes.begin_alike(self.policy)
-        later = self.policy.first_steps(options.steps)
-        self.ema = Ema(self.policy, optim.ema_decay, later)
+        spans = self.policy.spans(options.steps)
+        self.ema = Ema(self.policy, optim.ema_decay, spans)
         if options.sharding == FULL:
             shard(self.policy, self.device, loss="loss")
             shard(self.ema.policy, self.device)
-        self.optimiser = make_optimiser(self.policy, optim, later)
+        self.optimiser = make_optimiser(self.policy, optim, spans)
         self.state = TrainState(self.policy, self.ema.policy, self.optimiser)
         self.step = self.saved_step = 0
         self.train_s = 0.0  # spent in this process and earlier ones
@@ -179,7 +180,8 @@ class Trainer:
         seed = step_seed(self.seed, self.step)
         torch.manual_seed(seed)  # for dropout and others that take no generator
         for group in self.optimiser.param_groups:
-            group["lr"] = self._rate(group["first_step"])
+            group["lr"] = self._rate(group["span"])
+        self.ema.settle(self.step)
         share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
         for policy in (self.policy, self.ema.policy):
             policy.begin_step(self.step, self.options.steps)
@@ -204,15 +206,18 @@ class Trainer:
             "loss": loss_value,
             "grad_norm": norm,
             "clipped": clipped,
-            "lr": self.optimiser.param_groups[0]["lr"],
+            "lr": max(group["lr"] for group in self.optimiser.param_groups),
         }
         return measured | dict(zip(logs, means, strict=True))
 
-    def _rate(self, first: int) -> float:
-        """The learning rate of this step for parameters whose training begins at step `first`."""
+    def _rate(self, span: Span) -> float:
+        """The learning rate of this step for parameters that learn in the steps of `span`; 0 in others."""
+        first, end = span
+        if not first <= self.step < end:
+            return 0.0
         return learning_rate(
-            max(0, self.step - first),
-            steps=self.options.steps - first,
+            int(self.step - first),
+            steps=int(min(end, self.options.steps) - first),
             peak=self.optim.lr,
             warmup=self.optim.warmup,
             floor=self.optim.floor,

@@ -1,12 +1,12 @@
 """AdamW with weight decay where it belongs: on matrices and kernels."""
 
-from collections.abc import Mapping
 from types import MappingProxyType
 
 from torch import nn
 from torch.optim import AdamW
 
 from imfvla.training.options import OptimOptions
+from imfvla.training.spans import WHOLE, Span, Spans
 
 # Learned vectors that are looked up or added, not multiplied with: last part of their parameter names.
 UNDECAYED_NAMES = (
@@ -30,21 +30,19 @@ UNDECAYED_MODULES = (
 )
 
 
-def make_optimiser(
-    policy: nn.Module, options: OptimOptions, first_steps: Mapping[str, int] = MappingProxyType({})
-) -> AdamW:
+def make_optimiser(policy: nn.Module, options: OptimOptions, spans: Spans = MappingProxyType({})) -> AdamW:
     """AdamW over all trainable parameters; its rates are set by the loop before each step.
 
-    Parameters of equal decay and equal first step (0 where `first_steps` names none) are a group with a `first_step`.
+    Parameters of equal decay that learn in the same steps are a group, with a `span`.
     """
     decayed = decayed_parameters(policy)
-    groups: dict[tuple[int, bool], list[nn.Parameter]] = {}
+    groups: dict[tuple[Span, bool], list[nn.Parameter]] = {}
     for name, parameter in policy.named_parameters():
         if parameter.requires_grad:
-            groups.setdefault((first_steps.get(name, 0), name in decayed), []).append(parameter)
+            groups.setdefault((spans.get(name, WHOLE), name in decayed), []).append(parameter)
     groups = [
-        {"params": params, "weight_decay": options.weight_decay if decays else 0.0, "first_step": first}
-        for (first, decays), params in sorted(groups.items(), key=lambda item: (item[0][0], not item[0][1]))
+        {"params": params, "weight_decay": options.weight_decay if decays else 0.0, "span": span}
+        for (span, decays), params in sorted(groups.items(), key=lambda item: (item[0][0], not item[0][1]))
     ]
     return AdamW(groups, lr=options.lr, betas=options.betas, eps=options.eps, fused=True)
 

@@ -21,13 +21,11 @@ def generator(**changes):
         "velocity_head": True,
         "average_from": 0.5,
         "path_steps": 4,
-        "average_weight": 1.0,
         "boundary_share": 0.25,
         "time_power": 0.0,
         "adaptive_power": 0.0,
         "adaptive_offset": 1e-3,
         "draws": 2,
-        "compound_draws": 1,
         "clip": 1e6,
     }
     return StagedMeanFlow(**(options | changes))
@@ -124,32 +122,28 @@ def test_the_second_stage_starts_at_its_share_of_the_training_and_copies_once():
     assert not torch.equal(core.average.output.weight, core.output.weight)
 
 
-def test_before_it_the_loss_is_that_of_flow_matching_alone():
-    core, gen = Core(), generator()
-    actions, valid = draw(4)[0].float(), torch.ones(4, STEPS, dtype=torch.bool)
-    context = core.condition(torch.zeros(4, 3, 8))
-    gen.begin_step(core, 0, 2)
-    loss, logs = gen.loss(core, context, actions, valid, torch.Generator().manual_seed(1))
-    assert logs["average_error"] == 0
-    loss.mean().backward()
-    assert all(parameter.grad is None for parameter in core.average.parameters())
-
-
-def test_the_average_s_loss_reaches_its_own_blocks_alone():
-    """Context and instantaneous velocity learn nothing from it: their gradients are those of the first stage."""
-    gradients = []
+def test_each_stage_reaches_its_own_blocks_alone():
+    """Context and instantaneous velocity learn in the first stage, the average velocity in the second."""
     for step in (0, 2):
-        core, gen = Core(), generator(average_weight=10.0)
+        core, gen = Core(), generator()
         seen = torch.randn(4, 3, 8, generator=torch.Generator().manual_seed(2), requires_grad=True)
         gen.begin_step(core, step, 2)
         actions, valid = draw(4)[0].float(), torch.ones(4, STEPS, dtype=torch.bool)
-        loss, _ = gen.loss(core, core.condition(seen), actions, valid, torch.Generator().manual_seed(1))
+        loss, logs = gen.loss(core, core.condition(seen), actions, valid, torch.Generator().manual_seed(1))
         loss.mean().backward()
-        learned = {name: p.grad for name, p in core.named_parameters() if not name.startswith("average.")}
-        gradients.append(learned | {"context": seen.grad})
-        average = [p.grad for p in core.average.parameters()]
-    assert all(torch.equal(gradients[0][name], gradients[1][name]) for name in gradients[0])
-    assert all(gradient is not None for gradient in average)
+        assert [name for name, error in logs.items() if error > 0] == [
+            ("instant_error", "average_error")[step // 2]
+        ]
+        assert (seen.grad is not None) == (step == 0)
+        for name, parameter in core.named_parameters():
+            is_learned = gen.span(f"core.{name}", 2)[0] <= step // 2 < gen.span(f"core.{name}", 2)[1]
+            assert (parameter.grad is not None) == is_learned, name
+
+
+def test_encoder_and_instantaneous_velocity_learn_first_and_the_average_afterwards():
+    gen = generator(average_from=0.7)
+    assert gen.span("encoder.state.0.weight", 10) == gen.span("core.output.weight", 10) == (0, 7)
+    assert gen.span("core.average.output.weight", 10) == (7, 10)
 
 
 @pytest.mark.parametrize("parametrisation", ["velocity", "data"])
@@ -166,8 +160,23 @@ def test_more_steps_than_one_follow_v_where_the_average_is_of_the_whole_interval
     torch.testing.assert_close(parts.sample(flow, None, noise, 2), exact)
 
 
-@pytest.mark.parametrize("change", ["average_from=1.0", "average_from=-0.1", "path_steps=0"])
+@pytest.mark.parametrize(
+    "change", ["average_from=1.0", "average_from=-0.1", "path_steps=0", "velocity_head=false"]
+)
 def test_impossible_choices_are_refused_by_name(change):
-    config = compose("train", ["generator=imf_staged", f"generator.{change}"])
+    config = compose("train", ["generator=imf", f"generator.{change}"])
     with pytest.raises(UserError, match=rf"generator\.{change.split('=')[0]}"):
         construct(config["generator"], "generator")
+
+
+def test_one_step_needs_weights_of_the_second_stage():
+    gen = generator(boundary_share=1.0, average_from=0.75)
+    gen.check_nfe(1)
+    gen.begin_step(Core(), 1, 4)
+    gen.check_nfe(2)
+    with pytest.raises(
+        UserError, match=r"nfe=1 follows the average velocity.* in the last 25%.*checkpoint=last"
+    ):
+        gen.check_nfe(1)
+    gen.begin_step(Core(), 3, 4)
+    gen.check_nfe(1)

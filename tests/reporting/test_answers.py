@@ -47,7 +47,7 @@ def test_runs_with_other_overrides_and_seeds_of_selection_answer_nothing(tmp_pat
     write_evaluation(make_run(tmp_path / name / "core=standard", name), 2, number=100)
     write_evaluation(make_run(tmp_path / name / "default", name), 2, first_seed=10_000)
     write_evaluation(make_run(tmp_path / name / "default", name), 2, number=100, max_steps=50)
-    assert answer("socket_infer2", tmp_path).is_missing
+    assert answer("socket_imf_infer2", tmp_path).is_missing
 
 
 def test_a_run_stands_for_itself_with_the_usual_noise_and_each_noise_is_listed(tmp_path):
@@ -56,7 +56,7 @@ def test_a_run_stands_for_itself_with_the_usual_noise_and_each_noise_is_listed(t
     for noise in ({}, {"noise_scale": 0.5}, {"noise_scale": 0.0}):
         write_evaluation(run, 2, number=100, **noise)
     assert [found.noise_scale for found in rows(RunDirectory(run))] == [1.0]
-    in_row = answer("socket_infer2", tmp_path)
+    in_row = answer("socket_imf_infer2", tmp_path)
     assert [found.evaluation.noise_scale for found in in_row.evaluated] == [1.0]
     others = Sources([tmp_path]).others([in_row])
     assert [found.evaluation.label for [found] in others] == [f"{name}, noise 0", f"{name}, noise 0.5"]
@@ -166,15 +166,17 @@ def test_a_missing_run_is_proposed_with_all_evaluations_of_its_rows(tmp_path):
         "python -m imfvla.train +exp=socket_ph32_exec16 generator=l1 'evaluation.nfe=[1]'"
     )
     train, evaluate = answer("socket_infer1", tmp_path).command.split(" && ")
-    assert train == "python -m imfvla.train +exp=socket_ph32_exec16 'evaluation.nfe=[2,3]'"
+    assert (
+        train == "python -m imfvla.train +exp=socket_ph32_exec16 generator=imf_plain 'evaluation.nfe=[2,3]'"
+    )
     assert evaluate == (
-        "python -m imfvla.evaluate run=runs/socket_ph32_exec16/default nfe=1 checkpoint=1/3 first_seed=100000 "
-        "episodes=100"
+        "python -m imfvla.evaluate run=runs/socket_ph32_exec16/generator=imf_plain nfe=1 checkpoint=1/3 "
+        "first_seed=100000 episodes=100"
     )
 
 
 def test_where_the_weights_are_there_an_evaluation_is_proposed(tmp_path):
-    run = make_run(tmp_path / "socket_ph32_exec16" / "default", "socket_ph32_exec16")
+    run = make_run(tmp_path / "socket_ph32_exec16" / "generator=imf_plain", "socket_ph32_exec16")
     (run / "checkpoints" / f"step-{STEPS}").mkdir(parents=True)
     assert answer("socket_infer2", tmp_path).command == (
         f"python -m imfvla.evaluate run={run} nfe=2 first_seed=100000 episodes=100"
@@ -192,10 +194,10 @@ def test_training_evaluates_as_the_rows_want():
 
 
 def test_what_stands_in_no_row_is_listed(tmp_path):
-    folder = answer_row(tmp_path, ROWS["socket_infer2"])
+    folder = answer_row(tmp_path, ROWS["socket_imf_infer2"])
     name = "socket_ph32_exec16"
-    last = write_evaluation(folder.parents[1], 1, number=100)
-    another = write_evaluation(make_run(tmp_path / name / "seed=1", name, seed=1), 1, number=100)
+    last = write_evaluation(folder.parents[1], 10, number=100)
+    another = write_evaluation(make_run(tmp_path / name / "seed=1", name, seed=1), 10, number=100)
     standard = write_evaluation(make_run(tmp_path / name / "core=standard", name), 2, number=100)
     sources = Sources([tmp_path])
     others = sources.others([sources.answer(row, MAPPING) for row in MAPPING.rows])

@@ -4,6 +4,7 @@ import pytest
 from imfvla import tasks
 from imfvla.errors import UserError
 from imfvla.tasks.experts import make_expert
+from imfvla.tasks.experts.either_arm import EitherArmExpert
 from imfvla.tasks.experts.transfer import TransferExpert
 from imfvla.tasks.robot import JOINT_LIMITS
 
@@ -34,7 +35,8 @@ def test_demonstrations_succeed_stage_by_stage(env, modes):
             next(i for i, s in enumerate(stages) if s >= stage) for stage in range(1, len(env.stages) + 1)
         ]
         assert first == sorted(first)
-        assert set(stages) >= set(range(1, len(env.stages) + 1)) - ({3} if len(env.stages) == 4 else set())
+        passed_at_once = {"transfer": {3}, "either_arm": {1}}.get(env.goal or env.name, set())
+        assert set(stages) >= set(range(1, len(env.stages) + 1)) - passed_at_once
         assert 10 <= stages.count(len(env.stages)) <= 40
         assert all(d.action.dtype == d.executed.dtype == np.float32 for d in decisions)
         margin = np.array(JOINT_LIMITS)[6] - [states[:, [6, 14]].min(), states[:, [6, 14]].max()]
@@ -108,7 +110,7 @@ def test_noise_is_executed_and_not_recorded(env):
         env.step(decision.executed)
     spread = np.std(differences, axis=0)
     joints = np.arange(16) % 8 != 7
-    assert (spread[joints] > 1e-3).all()
+    assert (spread[joints] > 5e-4).all()  # an arm that keeps still bears a fifth
     assert np.abs(differences).max() < 0.06
     assert (spread[~joints] == 0).all()
 
@@ -144,9 +146,10 @@ def test_a_hand_that_dwells_closes_later_by_what_was_drawn_and_does_all_else_as_
     assert max(plain) == max(stages) == len(transfer_env.stages)
 
 
-def test_the_time_that_a_hand_dwells_is_geometric():
+@pytest.mark.parametrize("made", [TransferExpert, EitherArmExpert])
+def test_the_time_that_a_hand_dwells_is_geometric(made):
     """It has no memory: having waited says nothing about how much longer it will take."""
-    expert = TransferExpert(modes=1, noise=0.0, hold=18, dwell=26)
+    expert = made(modes=1, noise=0.0, hold=18, dwell=26)
     waits = np.array([expert.draw_style(np.random.default_rng(seed))["wait"] for seed in range(4000)])
     assert waits.min() == 1
     for steps in (8, 16, 48):
@@ -167,7 +170,7 @@ def test_the_time_that_a_hand_dwells_is_geometric():
         ({"name": "socket", "modes": 2, "noise": 1.0, "hold": 18, "dwell": 0}, "task.expert.noise"),
         (
             {"name": "socket", "modes": 2, "noise": 0.0, "hold": 18, "dwell": 26},
-            "task.expert.dwell must be 0: only the transfer expert waits, found 26",
+            "task.expert.dwell must be 0: only those of transfer and either_arm wait, found 26",
         ),
         ({"name": "transfer", "modes": 2, "noise": 0.0, "hold": 18, "dwell": -1}, "task.expert.dwell"),
     ],

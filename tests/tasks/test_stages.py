@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from imfvla.tasks.bimanual import Pose
+from imfvla.tasks.either_arm import EitherArmTask
+from imfvla.tasks.gate import BAR_LENGTH, GateTask
 from imfvla.tasks.kinematics import rotation_matrix
 from imfvla.tasks.props import RING_THICKNESS
 from imfvla.tasks.socket import PEG_LENGTH, SocketTask, measure_fit
@@ -20,6 +22,16 @@ def socket_task(monkeypatch) -> SocketTask:
 @pytest.fixture
 def transfer_task(monkeypatch) -> TransferTask:
     return _without_physics(monkeypatch, TransferTask("default"))
+
+
+@pytest.fixture
+def gate_task(monkeypatch) -> GateTask:
+    return _without_physics(monkeypatch, GateTask("default"))
+
+
+@pytest.fixture
+def either_task(monkeypatch) -> EitherArmTask:
+    return _without_physics(monkeypatch, EitherArmTask("default"))
 
 
 def _without_physics(monkeypatch, task):
@@ -107,3 +119,52 @@ def test_transfer_stages(transfer_task, held, touched, height, resting, stage):
     transfer_task.resting = {"bar"} if resting else set()
     transfer_task.poses = {"bar": Pose(np.array([0, 0, height]), np.eye(3))}
     assert transfer_task.stage(None) == stage
+
+
+@pytest.mark.parametrize(
+    ("x", "height", "resting", "stage"),
+    [
+        (0.25, 0.012, True, 1),
+        (0.25, AIR, False, 2),
+        (0.1 + BAR_LENGTH / 2 + 0.005, AIR, False, 2),
+        (0.1 + BAR_LENGTH / 2 - 0.005, AIR, False, 3),
+        (0.1 - BAR_LENGTH / 2 - 0.005, AIR, False, 3),
+        (0.1 - BAR_LENGTH / 2 - 0.01, AIR, False, 4),
+        (0.1 - BAR_LENGTH / 2 - 0.01, 0.012, True, 1),
+    ],
+)
+@pytest.mark.parametrize("turn", [0, np.pi])
+def test_gate_stages(gate_task, x, height, resting, stage, turn):
+    gate_task.resting = {"bar"} if resting else set()
+    bar = Pose(np.array([x, 0.05, height]), rotation_matrix(np.array([0, 0, turn])))
+    gate_task.poses = {"bar": bar, "post": Pose(np.array([0.1, 0, 0]), np.eye(3))}
+    assert gate_task.stage(None) == 0
+    gate_task.held = {("right", "bar")}
+    assert gate_task.stage(None) == stage
+    gate_task.touched_post = True
+    assert gate_task.stage(None) == 0
+
+
+@pytest.mark.parametrize(
+    ("held", "touched", "height", "distance", "alone", "shared"),
+    [
+        ("", "", 0.012, 0.2, 0, 0),
+        ("left", "", 0.012, 0.2, 1, 1),
+        ("left right", "", 0.012, 0.0, 2, 2),
+        ("left right", "", AIR, 0.0, 3, 3),
+        ("left", "right", AIR, 0.0, 1, 1),
+        ("right", "", AIR, 0.01, 1, 4),
+        ("left", "", AIR, 0.01, 1, 4),
+        ("left", "", AIR, 0.06, 1, 5),
+        ("right", "", AIR, 0.06, 1, 5),
+        ("", "", AIR, 0.06, 0, 0),
+    ],
+)
+def test_either_arm_stages(either_task, monkeypatch, held, touched, height, distance, alone, shared):
+    """An arm alone counts only after both have lifted the bar."""
+    either_task.held = {(side, "bar") for side in held.split()}
+    either_task.touched = {(side, "bar") for side in touched.split()}
+    either_task.poses = {"bar": Pose(np.array([0, 0, height]), np.eye(3))}
+    monkeypatch.setattr(either_task, "distance", lambda physics, side: distance)
+    for either_task.shared, stage in ((False, alone), (True, shared)):
+        assert either_task.stage(None) == stage

@@ -7,13 +7,32 @@ from imfvla.training.ema import Ema, decay_at
 
 def test_a_parameter_that_begins_later_forgets_what_it_began_with():
     policy = nn.Linear(1, 1)
-    average = Ema(policy, 0.999, {"weight": 100})
+    average = Ema(policy, 0.999, {"weight": (100, 200)})
     with torch.no_grad():
         policy.weight.fill_(5.0)
         for step in range(130):
             average.update(step)
             assert step >= 100 or average.policy.weight != 5.0
     torch.testing.assert_close(average.policy.weight, policy.weight, rtol=1e-4, atol=0)
+
+
+def test_a_parameter_that_no_longer_learns_takes_its_average_and_stays():
+    policy = nn.Linear(1, 1)
+    average = Ema(policy, 0.9, {"weight": (0, 3)})
+    with torch.no_grad():
+        for step in range(3):
+            policy.weight.fill_(float(step))
+            average.update(step)
+    average.settle(2)
+    assert policy.weight == 2.0
+    average.settle(3)
+    kept = average.policy.weight.clone()
+    assert policy.weight == kept != 2.0
+    assert (policy.weight.requires_grad, policy.bias.requires_grad) == (False, True)
+    with torch.no_grad():
+        policy.weight.fill_(9.0)
+    average.update(3)
+    assert average.policy.weight == kept
 
 
 def test_decay_rises_to_its_limit():

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -56,14 +57,12 @@ class StagedPolicy(nn.Module):
         self.encoder = nn.Linear(STATE, 8)
         self.generator = StagedMeanFlow(
             parametrisation="data", times=HighNoiseTimes(), velocity_head=True, average_from=0.5, path_steps=2,
-            average_weight=1.0, boundary_share=0.5, time_power=2.0, adaptive_power=0.5, adaptive_offset=1e-3,
-            draws=2, compound_draws=1, clip=10.0,
+            boundary_share=0.5, time_power=2.0, adaptive_power=0.5, adaptive_offset=1e-3, draws=2, clip=10.0,
         )  # fmt: skip
         self.dies_at, self.step = dies_at, 0
 
-    def first_steps(self, steps):
-        later = self.generator.first_steps(self.core, steps)
-        return {f"core.{name}": step for name, step in later.items()}
+    def spans(self, steps):
+        return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
 
     def begin_step(self, step, steps):
         self.step = step
@@ -139,9 +138,23 @@ def test_the_average_of_the_weights_starts_a_stage_from_its_own(tmp_path, make_t
     trainer = make_trainer(tmp_path, StagedPolicy(dies_at=2))
     with pytest.raises(Killed):
         trainer.train()
-    for core in (trainer.policy.core, trainer.ema.policy.core):
+    learned, averaged = trainer.policy.core, trainer.ema.policy.core
+    for core in (learned, averaged):
         assert torch.equal(core.average.output.weight, core.output.weight)
-    assert not torch.equal(trainer.policy.core.output.weight, trainer.ema.policy.core.output.weight)
+    assert torch.equal(learned.output.weight, averaged.output.weight)
+
+
+def test_what_no_longer_learns_stays_as_its_average(tmp_path, make_trainer):
+    """The first stage ends before step 2 of 4; only the blocks of the average velocity change afterwards."""
+    states = []
+    for dies_at in (2, None):
+        trainer = make_trainer(tmp_path / str(dies_at), StagedPolicy(dies_at=dies_at))
+        with nullcontext() if dies_at is None else pytest.raises(Killed):
+            trainer.train()
+        states.append({name: p.detach().clone() for name, p in trainer.ema.policy.named_parameters()})
+    changed = {name for name, before in states[0].items() if not torch.equal(before, states[1][name])}
+    assert changed
+    assert all(name.startswith("core.average.") for name in changed)
 
 
 def test_resume_from_an_older_state_repeats_no_row(tmp_path, make_trainer):

@@ -5,6 +5,7 @@ from tiny_policy import OPTIM, TinyPolicy
 from torch import nn
 
 from imfvla.training.optimiser import decayed_parameters, make_optimiser
+from imfvla.training.spans import WHOLE
 
 
 class Everything(nn.Module):
@@ -45,7 +46,7 @@ def test_decay_shrinks_what_has_no_gradient_signal():
         torch.testing.assert_close(parameter.detach(), factor * before[name])
 
 
-def test_parameters_that_begin_later_have_groups_of_their_own():
+def test_parameters_that_learn_in_other_steps_have_groups_of_their_own():
     policy = nn.Linear(2, 2)
-    groups = make_optimiser(policy, OPTIM, {"weight": 7}).param_groups
-    assert [(group["first_step"], len(group["params"])) for group in groups] == [(0, 1), (7, 1)]
+    groups = make_optimiser(policy, OPTIM, {"weight": (7, 9)}).param_groups
+    assert [(group["span"], len(group["params"])) for group in groups] == [(WHOLE, 1), ((7, 9), 1)]

@@ -50,7 +50,7 @@ class TinyPolicy(nn.Module):
         self.query = nn.Parameter(torch.zeros(2, 16))  # never used: AdamW keeps nothing of it
         self.register_buffer("scale", torch.ones(ACTION))
 
-    def first_steps(self, steps: int) -> dict[str, int]:
+    def spans(self, steps: int) -> dict[str, tuple[float, float]]:
         return {}
 
     def begin_step(self, step: int, steps: int) -> None:

@@ -14,6 +14,7 @@ from imfvla.episode import Decision
 from imfvla.errors import UserError
 from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, BimanualTask, Pose
 from imfvla.tasks.kinematics import ArmKinematics, about_z, rotation_matrix, rotation_vector
+from imfvla.tasks.robot import home_joints
 
 CARROT_S = 0.065  # the arms' lag and half a control step: how far ahead of the hand its command lies
 SPEED, TURN_SPEED = 0.125, 2.0  # m/s, rad/s
@@ -33,6 +34,7 @@ class Hand:
     def __init__(self, task: BimanualTask, side: str, kinematics: ArmKinematics) -> None:
         self.side = side
         self._task, self._kinematics = task, kinematics
+        self.home = kinematics.pose(home_joints())
         self.pose: Pose = None  # measured
         self.joints: np.ndarray = None  # measured (7,)
         self.opening = 1.0  # measured
@@ -74,8 +76,9 @@ class Expert:
             4 both are drawn, independently. Nothing in the observation shows what was drawn.
         noise: standard deviation [rad] of the joint noise that is executed but not recorded as action.
         hold: control steps for which a demonstration continues after success, so that it shows holding too.
-        dwell: mean of the geometric time [control steps] that the transfer expert waits with its left hand around the
-            bar before it closes; 0 closes at once. Nothing in the observation shows how long it will wait.
+        dwell: mean of the geometric time [control steps] that an expert waits before it hands over: with its left hand
+            around the bar before it closes (transfer), with both hands on the bar before one lets go (either_arm); 0
+            waits for nothing. Nothing in the observation shows how long it will wait.
     """
 
     task_name: str
@@ -89,7 +92,9 @@ class Expert:
         if hold < 1:
             raise UserError(f"task.expert.hold is a number of control steps, at least 1, found {hold!r}.")
         if dwell < 0 or (dwell and not self.dwells):
-            wanted = "at least 0 control steps" if self.dwells else "0: only the transfer expert waits"
+            wanted = (
+                "at least 0 control steps" if self.dwells else "0: only those of transfer and either_arm wait"
+            )
             raise UserError(f"task.expert.dwell must be {wanted}, found {dwell!r}.")
         self.modes, self.noise, self.hold, self.dwell = modes, noise, hold, dwell
         self.style: dict[str, Any] = {}
