@@ -62,9 +62,8 @@ tables: setup  ## Make the paper's tables and figures and a page from the run di
 report: setup  ## Make them in experiments/report, with videos and recordings: a folder to send or serve
 	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
-gallery: setup  ## Write pictures of every view of both tasks
-	$(PY) -m imfvla.gallery task=socket $(ARGS)
-	$(PY) -m imfvla.gallery task=transfer $(ARGS)
+gallery: setup  ## Write pictures of every view of the tasks
+	for task in socket transfer either_arm gate; do $(PY) -m imfvla.gallery task=$$task $(ARGS); done
 
 test: setup  ## Run the tests on two processes (ARGS="tests/tasks -k seed")
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 $(ARGS)

@@ -18,7 +18,7 @@ from imfvla.files import write_together
 from imfvla.options import build, within
 
 if TYPE_CHECKING:
-    from imfvla.tasks.bimanual import BimanualEnvironment
+    from imfvla.tasks.bimanual_environment import BimanualEnvironment
 
 MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
 

@@ -9,6 +9,9 @@ from typing import Annotated, Any
 from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
+# Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
+# tables are for reporting alone.
+SELECTION_FIRST_SEED, REPORTING_FIRST_SEED = 10_000, 100_000
 LAST = "last"  # of the weights that are kept
 MAX_SEED = 2**32 - 1  # the highest that numpy's generators and MuJoCo's start states accept
 MAX_EPISODES = 1_000_000

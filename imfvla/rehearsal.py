@@ -68,7 +68,7 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
 
 
 def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
-    """The configured policy, after a loss and a chunk on black pictures.
+    """The configured policy, after the losses of its first and last step and a chunk on black pictures.
 
     Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
     """
@@ -79,7 +79,12 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
         observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():
-            loss, _ = policy.loss(Batch(observation, noise, valid), torch.Generator().manual_seed(0))
+            steps = config["training"]["steps"]
+            losses = []
+            for step in (0, steps - 1) if policy.has_stages else (0,):
+                policy.begin_step(step, steps)
+                rng = torch.Generator().manual_seed(0)
+                losses.append(policy.loss(Batch(observation, noise, valid), rng)[0])
             chunk = policy.predict(observation, noise, min(nfe))
     except UserError:
         raise
@@ -88,8 +93,9 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
             "the configured policy cannot compute a loss and a chunk: correct encoder, core or generator; torch says "
             f"{reason_of(error)!r}."
         ) from error
-    is_finite = bool(loss.isfinite() and chunk.isfinite().all())
-    require(is_finite, "the first loss and chunk of encoder, core and generator", "finite", float(loss))
+    is_finite = bool(torch.stack(losses).isfinite().all() and chunk.isfinite().all())
+    found = [float(loss) for loss in losses]
+    require(is_finite, "the first losses and chunk of encoder, core and generator", "finite", found)
     return policy
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from imfvla.options import require
 
 SMALLEST = (8, 8)  # (H, W) [px]
-LARGEST = (960, 1280)  # (H, W) [px] of the buffer that the renderer draws into
+LARGEST = (960, 1280)  # (H, W) [px]; the scene of our own tasks has a buffer of this size to draw into
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,14 +15,16 @@ from imfvla import workbench
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.evaluation import evaluate
+from imfvla.figures.panels import stages_of, tasks_of
 from imfvla.horizon import Horizon
 from imfvla.protocol import EvaluationOptions
 from imfvla.recording import McapSink, VideoSink, read_episode, read_index
-from imfvla.reporting.answers import Sources
+from imfvla.reporting.answers import Sources, check_equal_protocols
+from imfvla.reporting.mapping import PATH, read_mapping
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import table_of
-from imfvla.reporting.tables import other_table
+from imfvla.reporting.tables import other_table, row_table
 from imfvla.robot import Camera, RobotSpec
 from imfvla.rollout import SIMULATION_ENDED, run_episode
 from imfvla.run_directory import RunDirectory
@@ -129,8 +131,9 @@ def build(run: Path, step: int) -> tuple[PlainEnvironment, KnownPolicy]:
     return PlainEnvironment(name=run.parent.name, robot=robot, stages=stages), policy
 
 
-def test_an_evaluation_has_rows_a_summary_recordings_and_its_row_of_a_table(world, tmp_path):
-    run = RunDirectory(tmp_path / world.name / "default")
+def evaluated(world: PlainEnvironment, root: Path) -> RunDirectory:
+    """A run of the world's name below `root`, with weights that nobody reads, and its evaluation."""
+    run = RunDirectory(root / world.name / "default")
     run.weights_directory(10).mkdir(parents=True)
     (run.weights_directory(10) / "policy.safetensors").write_bytes(b"weights")
     config = {
@@ -142,9 +145,14 @@ def test_an_evaluation_has_rows_a_summary_recordings_and_its_row_of_a_table(worl
     }
     (run.path / "config.yaml").write_text(yaml.safe_dump(config))
     workbench._bench.cache_clear()
-    options = EvaluationOptions(episodes=4, first_seed=100_000, nfe=(1,), workers=0)
-    (summary,) = evaluate(run, options, build=build)
-    folder = run.rollouts(summary["name"])
+    evaluate(run, EvaluationOptions(episodes=4, first_seed=100_000, nfe=(1,), workers=0), build=build)
+    return run
+
+
+def test_an_evaluation_has_rows_a_summary_recordings_and_its_row_of_a_table(world, tmp_path):
+    run = evaluated(world, tmp_path)
+    (found,) = rows(run)
+    folder, summary = found.folder, found.summary
     lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
     assert [len(line["first_step_of_stage"]) for line in lines] == [len(world.stages)] * 4
     assert summary["success_episodes"] == (1 if world.stages else 2)
@@ -157,6 +165,32 @@ def test_an_evaluation_has_rows_a_summary_recordings_and_its_row_of_a_table(worl
     (row,) = other_table([result]).shown.rows
     assert row[0] == world.name
     assert row[7].startswith(f"{summary['success_episodes']}/4 [")
+
+
+def test_a_new_task_has_its_table_and_panels_from_the_mapping_alone(world, tmp_path):
+    evaluated(world, tmp_path / "runs")
+    path = tmp_path / "tables.yaml"
+    row = (
+        "{ name: known, method: Known, setting: infer1, experiment: %s, nfe: 1, evaluation: { episodes: 4 } }"
+    )
+    text = PATH.read_text().replace("\ntasks:\n", f"\ntasks:\n  {world.name}: {{ title: a new task }}\n")
+    table = f"  table4: {{ title: Known policies, task: {world.name} }}"
+    path.write_text(
+        text.replace("\ntables:\n", f"\ntables:\n{table}\n") + f"table4:\n  - {row % world.name}\n"
+    )
+    mapping = read_mapping(path)
+    sources = Sources([tmp_path / "runs"])
+    (answer,) = (sources.answer(of_table, mapping) for of_table in mapping.of_table("table4"))
+    check_equal_protocols([answer], mapping.table("table4").task)
+    result = Result.of(answer)
+    shown = row_table(mapping.table("table4").title, [result]).shown
+    assert shown.title == "Known policies"
+    assert shown.rows[0][:3] == ("Known (infer1)", "1", "ours")
+    assert shown.rows[0][7].startswith("1/4" if world.stages else "2/4")
+    assert list(tasks_of([result])) == ["socket", "transfer", world.name]
+    assert stages_of(world.name, [result]) == world.stages
+    with pytest.raises(UserError, match=f"table4 is of the task socket, but .* played {world.name}"):
+        check_equal_protocols([answer], "socket")
 
 
 def test_a_world_that_ends_early_has_failed_unless_it_has_succeeded():

@@ -144,9 +144,11 @@ MAY_IMPORT = {
         "instruction",
         "policy",
         "progress",
+        "protocol",
         "recording",
         "reporting",
         "robot",
+        "tasks",
         "types",
     },
     "data": {

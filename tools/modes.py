@@ -25,7 +25,6 @@ from imfvla.files import write_json, write_together
 from imfvla.modes.grippers import grippers_of
 from imfvla.modes.observations import Stops
 from imfvla.modes.recordings import (
-    SELECTION_FIRST_SEED,
     choose_recordings,
     read_demonstration,
     record_starts,
@@ -33,6 +32,7 @@ from imfvla.modes.recordings import (
 )
 from imfvla.modes.report import measure, modes_table
 from imfvla.progress import Progress
+from imfvla.protocol import SELECTION_FIRST_SEED
 from imfvla.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
 

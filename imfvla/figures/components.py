@@ -46,7 +46,17 @@ LEARNS = {
     "Regression": (
         "Regression: what is learnt",
         r"$x_\theta(0)\;\longrightarrow\; x$",
-        ("the absolute error of the action itself",),
+        ("the error of the action itself",),
+    ),
+    "TwoStepRegression": (
+        "Two-step regression: what is learnt",
+        r"$x_\theta(0, 1)\;\longrightarrow\; x \;\longleftarrow\; x_\theta(z_s, s)$",
+        ("the action from nothing, and from itself with a little noise",),
+    ),
+    "ImplicitMaximumLikelihood": (
+        "IMLE: what is learnt",
+        r"$x_\theta(e_m)\;\longrightarrow\; x,\quad m = \mathrm{argmin}_j\,|x_\theta(e_j) - x|$",
+        ("of several samples, the one nearest to the action learns it",),
     ),
 }
 PREDICTIONS = {"epsilon": r"$\;\epsilon$", "sample": r"$\;x$", "v": r"$\;v$"}  # of diffusion

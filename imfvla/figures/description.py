@@ -23,6 +23,8 @@ GENERATOR = {
     "FlowMatching": "flow matching",
     "DenoisingDiffusion": "diffusion (DDPM)",
     "Regression": "L1 regression",
+    "TwoStepRegression": "two-step regression",
+    "ImplicitMaximumLikelihood": "one-step IMLE",
     "ActionChunking": "ACT",
 }
 TIMES = {
@@ -114,7 +116,7 @@ def describe(config: Mapping[str, Any]) -> Method:
         block_size=residual.get("block_size", 1),
         readout=residual.get("readout", "sum"),
         generator_class=_class(generator),
-        generator=_name(generator, GENERATOR),
+        generator="L2 regression" if generator.get("power") == 2 else _name(generator, GENERATOR),
         parametrisation=generator.get("parametrisation"),
         times=_name(times, TIMES) if times else None,
         boundary_share=generator.get("boundary_share"),

@@ -23,7 +23,7 @@ OUTPUTS = {"data": "clean action as output", "velocity": "velocity as output"}  
 # what gives the loss of a generator other units: curves that differ in it are not compared
 UNITS = (
     "parametrisation", "prediction", "times", "time_power", "adaptive_power", "compound_target", "instant_weight",
-    "kl_weight",
+    "kl_weight", "power",
 )  # fmt: skip
 Curves = dict[str, tuple[np.ndarray, np.ndarray]]  # steps and losses by name
 

@@ -30,7 +30,7 @@ FATE_NAMES = {
     "closes": "closes", "holds on": "closes, lets go too late", "waits": "waits", "lets go": "lets go too early",
     "between": "neither open nor closed",
 }  # fmt: skip
-LINES = (GREEN, PURPLE, BROWN, GREY)  # of numbers of evaluations: colours that no fate has
+LINES = (GREEN, PURPLE, BROWN, GREY)  # one for each NFE: colours that no fate has
 ROW_HEIGHT = 2.7  # inches
 FEWEST_BARS = 3  # that a panel has room for, so that one alone is not a block
 

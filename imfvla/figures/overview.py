@@ -115,7 +115,7 @@ def _generator(sheet: Sheet, method: Method) -> None:
     left, right = 99.0, 121.5
     rows = method.nfe[:4]
     top, each = (54.0, 8.4) if len(rows) > 1 else (47.0, 0.0)
-    if method.generator_class != "Regression":
+    if method.generator_class not in ("Regression", "TwoStepRegression"):
         sheet.text(left, top + 3.2, "noise", size=7)
         sheet.text(right, top + 3.2, "actions", size=7)
     for index, nfe in enumerate(rows):

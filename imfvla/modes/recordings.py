@@ -20,9 +20,9 @@ from imfvla.environments import BIMANUAL, KIND, kind_of
 from imfvla.errors import UserError
 from imfvla.files import locked
 from imfvla.progress import Progress
+from imfvla.protocol import REPORTING_FIRST_SEED
 from imfvla.recording import Episode, read_episode
 
-SELECTION_FIRST_SEED, REPORTING_FIRST_SEED = 10_000, 100_000
 MOST_FAILURES = 20  # of the expert, before it is given up
 # What a recording must share with the run. Its noise, and the time held after success, may differ.
 SHARED = ("task", "variant", "modes", "dwell", "image_size")

@@ -1,4 +1,4 @@
-"""What samples are, with several numbers of evaluations beside the demonstrations: numbers, curves and a table.
+"""What samples are, with several NFE beside the demonstrations: numbers, curves and a table.
 
 Shapes: N observations, K samples of each, Tp predicted steps, A action.
 """
@@ -50,7 +50,7 @@ SPREAD_NOTE = (
 def measure(
     policy: Policy, stops: Stops, nfes: Sequence[int], num: int, modes: int, advance: Callable[[], None]
 ) -> dict[str, Any]:
-    """Rows by "demonstrations" and number of evaluations, `num` samples at each place.
+    """Rows by "demonstrations" and NFE, `num` samples at each place.
 
     `advance` is called after each number. Raises UserError where the generator does not take one of them.
     """
@@ -94,7 +94,7 @@ def measure(
 
 
 def modes_table(measured: Mapping[str, Any], title: str) -> Table:
-    """A row for the demonstrations and for each number of evaluations."""
+    """A row for the demonstrations and for each NFE."""
     rows, num = measured["rows"], measured["observations"]
     shown = [column for column in COLUMNS if any(row.get(column[1]) is not None for row in rows.values())]
     cells = tuple(
@@ -109,7 +109,7 @@ def modes_table(measured: Mapping[str, Any], title: str) -> Table:
     )
     return Table(
         title,
-        ("evaluations", *(name for name, *_ in shown)),
+        ("NFE", *(name for name, *_ in shown)),
         cells,
         tuple(text for key, text in notes if key in keys),
     )

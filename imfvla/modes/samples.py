@@ -18,7 +18,7 @@ def draw_samples(policy: Policy, observations: Observations, nfe: int, num: int)
     """float32 (N, num, Tp, A) in physical units.
 
     The noise of sample k at step s of the demonstration from `seed` is drawn from SeedSequence([k, seed, s]) alone, so
-    that all policies with equal chunks, and all numbers of evaluations, see the same.
+    that all policies with equal chunks, and all NFE, see the same.
     """
     device = next(policy.parameters()).device
     each = max(ROWS // num, 1)

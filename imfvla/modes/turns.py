@@ -6,9 +6,8 @@ Shapes: N observations, K samples of each, Tp predicted steps, S state, A action
 import numpy as np
 
 from imfvla.robot import RobotSpec, bare_name
+from imfvla.tasks.bimanual_robot import DRAWN_WRISTS
 
-# By `task.expert.modes`: the wrists whose way is drawn. Hands point down, so that a wrist's roll is the gripper's yaw.
-DRAWN_WRISTS = {1: (), 2: ("right/joint_7",), 4: ("left/joint_7", "right/joint_7")}
 STEPS = 16  # the experts roll a wrist by some 0.9 rad in so many control steps, to one side or the other
 BRIDGE, ARRIVED = 0.25, 0.75  # rad
 

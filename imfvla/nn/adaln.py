@@ -7,9 +7,6 @@ leave the queries of Attention Residuals without gradient, and their norm would 
 Shapes: B batch, H steps, A channels, K action tokens, L context tokens, D width.
 """
 
-import copy
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -62,11 +59,8 @@ class AdaptiveNormCore(TransformerCore):
 
     block = AdaptiveBlock
 
-    def __init__(self, *, width: int, **options: Any) -> None:
-        super().__init__(width=width, **options)
-        self.modulation = Modulation(width, (0.0, 1.0))  # of the last norm
-        if self.average is not None:
-            self.average.modulation = copy.deepcopy(self.modulation)
+    def add_layers(self) -> None:
+        self.modulation = Modulation(self.width, (0.0, 1.0))  # of the last norm
 
     def condition(self, context: Tensor) -> Conditioning:
         """Takes the summary, the last of the context tokens (B, L, D)."""

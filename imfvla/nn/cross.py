@@ -6,8 +6,6 @@ observation.
 Shapes: B batch, L context tokens, D width.
 """
 
-from typing import Any
-
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -40,11 +38,10 @@ class CrossAttentionCore(TransformerCore):
 
     block = CrossBlock
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        if self.average is not None:  # the context's keys and values are those of the other blocks
-            for block in self.average.blocks:
-                del block.cross_attention.key_value
+    def drop_context(self) -> None:
+        super().drop_context()
+        for block in self.blocks:
+            del block.cross_attention.key_value
 
     def condition(self, context: Tensor) -> Conditioning:
         """Keys and values of the context tokens (B, L, D), of which the last one is a summary, for every block."""

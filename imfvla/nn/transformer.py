@@ -134,11 +134,19 @@ class TransformerCore(nn.Module):
         self.output = Linear(width, patch * channels)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
+        self.add_layers()
         self.interface = "flow and v-head" if velocity_head else "flow"
         self.average: TransformerCore | None = None
         if velocity_head:
             self.average = copy.deepcopy(self)
-            del self.average.summary
+            self.average.drop_context()
+
+    def add_layers(self) -> None:
+        """Layers of a subclass, which the average velocity has too."""
+
+    def drop_context(self) -> None:
+        """Takes away what prepares the context: the average velocity reads the one of the other blocks."""
+        del self.summary
 
     def condition(self, context: Tensor) -> Conditioning:
         """Runs the context tokens (B, L, D), of which the last one is a summary, through the stack once."""

@@ -3,8 +3,9 @@
 Numbers then have plot paths, as in `/robot/state.left.joint_1`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import reduce
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ import numpy as np
 from imfvla.recording.schemas import NUMBER, Schema, object_of
 from imfvla.robot import bare_name
 
-Tree = dict[
-    str, Any
-]  # nested by the slashes of the names; a number or None, which is not finite, at each end
+Number = float | None  # None where it is not finite
+NUMBERS = (float, int, NoneType)  # what JSON has for it
+Tree = dict[str, Any]  # nested by the slashes of the names, a Number at each end
 
 
 class Misfit(ValueError):
@@ -29,38 +30,34 @@ class Channels:
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(bare_name(name) for name in names)
-        self._paths = [tuple(name.split("/")) for name in self.names]
+        self._places: Tree = {}  # the tree with the index of each channel at its end
+        for index, name in enumerate(self.names):
+            *groups, last = name.split("/")
+            reduce(lambda part, group: part.setdefault(group, {}), groups, self._places)[last] = index
 
     def tree(self, values: np.ndarray) -> Tree:
         """The message of values (C,)."""
-        tree: Tree = {}
-        for (*groups, last), value in zip(self._paths, numbers(values), strict=True):
-            reduce(lambda part, group: part.setdefault(group, {}), groups, tree)[last] = value
-        return tree
+        if len(values) != len(self.names):
+            raise ValueError(f"Wanted {len(self.names)} values, found {len(values)}.")
+        return _filled(self._places, numbers(values))
 
     def schema(self, title: str) -> Schema:
         """JSON Schema of such messages."""
-        tree: Tree = {}
-        for *groups, last in self._paths:
-            reduce(lambda part, group: part.setdefault(group, {}), groups, tree)[last] = None
-        return _schema(title, tree)
+        return _schema(title, self._places)
 
-    def values(self, tree: Any) -> list[float | None]:
+    def values(self, tree: Any) -> list[Number]:
         """Inverse of `tree`. Raises Misfit where a channel is missing, is no number, or is of another robot."""
-        found = []
-        for name, path in zip(self.names, self._paths, strict=True):
-            value = tree
-            for part in path:
-                if not isinstance(value, dict) or part not in value:
-                    raise Misfit(name, "there", f"only {_listed(_names(tree))}")
-                value = value[part]
-            if value is not None and not isinstance(value, int | float):
-                raise Misfit(name, "a number", repr(value)[:80])
-            found.append(value)
-        if len(found) != sum(1 for _ in _names(tree)):
-            unknown = [name for name in _names(tree) if name not in self.names]
-            raise Misfit(unknown[0], f"absent from the {len(found)} channels", "a value")
-        return found
+        found: list[Number] = [None] * len(self.names)
+        if _take(tree, self._places, found):
+            return found
+        there = dict(_ends(tree))
+        for name in self.names:
+            if name not in there:
+                raise Misfit(name, "there", f"only {', '.join(there)[:200] or 'nothing'}")
+            if type(there[name]) not in NUMBERS:
+                raise Misfit(name, "a number", repr(there[name])[:80])
+        unknown = next(name for name in there if name not in self.names)
+        raise Misfit(unknown, f"absent from the {len(found)} channels", "a value")
 
 
 def numbers(values: np.ndarray) -> list:
@@ -69,21 +66,41 @@ def numbers(values: np.ndarray) -> list:
     return (values if np.isfinite(values).all() else np.where(np.isfinite(values), values, None)).tolist()
 
 
-def _schema(title: str, tree: Tree) -> Schema:
+def _filled(places: Tree, values: list) -> Tree:
+    return {
+        name: _filled(place, values) if isinstance(place, dict) else values[place]
+        for name, place in places.items()
+    }
+
+
+def _take(tree: Any, places: Tree, found: list[Number]) -> bool:
+    """Puts the numbers of a tree into their places; False where it is of other channels."""
+    if not isinstance(tree, dict) or tree.keys() != places.keys():
+        return False
+    for name, place in places.items():
+        value = tree[name]
+        if isinstance(place, dict):
+            if not _take(value, place, found):
+                return False
+        elif type(value) not in NUMBERS:
+            return False
+        else:
+            found[place] = value
+    return True
+
+
+def _schema(title: str, places: Tree) -> Schema:
     parts = {
-        name: NUMBER if part is None else _schema(f"{title}.{name}", part) for name, part in tree.items()
+        name: _schema(f"{title}.{name}", place) if isinstance(place, dict) else NUMBER
+        for name, place in places.items()
     }
     return object_of(title, **parts)
 
 
-def _names(tree: Any, prefix: str = "") -> Any:
-    """The slashed names of all ends of a tree."""
+def _ends(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The slashed names of all ends of a tree, with what is there."""
     if not isinstance(tree, dict):
-        yield prefix or "no channels"
+        yield prefix, tree
         return
     for name, part in tree.items():
-        yield from _names(part, f"{prefix}/{name}" if prefix else str(name))
-
-
-def _listed(names: Any) -> str:
-    return ", ".join(names)[:200] or "nothing"
+        yield from _ends(part, f"{prefix}/{name}" if prefix else str(name))

@@ -7,13 +7,10 @@ from typing import Any
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.protocol import USUAL_NOISE, as_recorded
+from imfvla.protocol import REPORTING_FIRST_SEED, USUAL_NOISE, as_recorded
 from imfvla.reporting.mapping import TableRow, read_mapping, run_key
 from imfvla.run_directory import RunDirectory, training_steps
 
-REPORTING_FIRST_SEED = (
-    100_000  # seeds from here on are for tables; lower ones for demonstrations and selection
-)
 REMEDY = ": evaluate again with overwrite=true"
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",

@@ -12,7 +12,7 @@ from imfvla.tasks.bimanual_robot import ALL_VIEWS, TIME_LIMIT_STEPS, bimanual_ro
 from imfvla.tasks.catalogue import NAMES, class_at, entry_of, text_for
 
 if TYPE_CHECKING:
-    from imfvla.tasks.bimanual import BimanualEnvironment
+    from imfvla.tasks.bimanual_environment import BimanualEnvironment
 
 select_before_simulators()
 
@@ -52,6 +52,6 @@ def load(
     if variant not in VARIANTS:
         raise UserError(f"task.variant must be one of {', '.join(VARIANTS)}, found {variant!r}.")
     # mujoco is imported here, only by code that simulates.
-    from imfvla.tasks.bimanual import BimanualEnvironment
+    from imfvla.tasks.bimanual_environment import BimanualEnvironment
 
     return BimanualEnvironment(class_at(entry.task)(variant), image_size=image_size, views=views)

@@ -10,6 +10,8 @@ JOINT_LIMITS = ((-2.9, 2.9), (-2.0, 2.0), (-2.9, 2.9), (-0.1, 2.7), (-2.9, 2.9),
 GRIPPER, GRIPPER_LIMITS = "gripper [0, 1]", (0.0, 1.0)
 CONTROL_HZ = 50
 TIME_LIMIT_STEPS = 700  # of an episode of every task
+# By `task.expert.modes`: the wrists whose way is drawn. Hands point down, so that a wrist's roll is the gripper's yaw.
+DRAWN_WRISTS = {1: (), 2: ("right/joint_7",), 4: ("left/joint_7", "right/joint_7")}
 ALL_VIEWS = ("front", "top", "r_wrist", "l_wrist")
 
 

@@ -85,6 +85,13 @@ def test_the_components_are_those_configured(config, key, value):
             "adaptive norms (DiT)",
             "Flow matching: what is learnt",
         ),
+        (["generator=l2", "evaluation.nfe=[1]"], "L2 regression", "Regression: what is learnt"),
+        (
+            ["generator=two_step", "evaluation.nfe=[2]"],
+            "two-step regression",
+            "Two-step regression: what is learnt",
+        ),
+        (["generator=imle", "evaluation.nfe=[1]"], "one-step IMLE", "IMLE: what is learnt"),
         (
             ["encoder=resnet18_attnres", "scale=paper"],
             "12 blocks, width 384",

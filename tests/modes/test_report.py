@@ -100,7 +100,7 @@ def test_without_known_modes_spread_and_jumps_are_left(actions):
     actions[:, [LEFT, RIGHT]] = 1.0
     measured = measure(TwoWays(actions), stops_of(actions), [2], 8, modes=1, advance=lambda: None)
     columns = modes_table(measured, "samples").columns
-    assert columns == ("evaluations", "spread", "spread / error", "jump [rad]", "jump")
+    assert columns == ("NFE", "spread", "spread / error", "jump [rad]", "jump")
     assert len(modes_figure(measured, "samples").axes) == 2
 
 

@@ -10,6 +10,7 @@ import yaml
 from rich.console import Console
 
 from imfvla.errors import UserError
+from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
 from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import print_row
@@ -56,7 +57,8 @@ def make_run(path: Path, name: str = "socket_ph32_exec16") -> Path:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run with an evaluation that the paper has (nfe 1) and one that it has not (nfe 4)."""
-    path = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "default")
+    (name,) = (row.run for row in read_mapping().rows if row.name == "socket_infer1")
+    path = make_run(tmp_path / "runs" / "socket_ph32_exec16" / name)
     for nfe in (4, 1):
         write_evaluation(path, nfe)
     return path

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from imfvla import tasks
-from imfvla.tasks.bimanual import BimanualEnvironment
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 
 
 @pytest.fixture(scope="package", params=tasks.NAMES)

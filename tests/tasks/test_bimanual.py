@@ -1,3 +1,6 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -216,3 +219,14 @@ def test_the_bar_looks_the_same_turned_by_half_a_turn(transfer_env):
 def test_mistakes_in_loading_are_named(arguments, message):
     with pytest.raises(UserError, match=message):
         tasks.load(**arguments)
+
+
+@pytest.mark.parametrize("name", ["socket", "transfer"])
+def test_committed_evaluations_began_where_their_seeds_begin_now(name):
+    run = Path(__file__).parents[2] / "experiments" / "pretrained" / f"{name}_ph32_exec16"
+    lines = next(run.glob("rollouts/*/episodes.jsonl")).read_text().splitlines()
+    env = tasks.load(name)
+    for row in map(json.loads, lines[:3]):
+        env.reset(row["seed"])
+        assert env.start_digest() == row["start_digest"]
+    env.close()

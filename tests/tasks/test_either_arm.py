@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
-from imfvla.tasks.bimanual import SIDES, BimanualEnvironment
+from imfvla.tasks.bimanual import SIDES
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.either_arm import EitherArmExpert
 
 SEED = 4

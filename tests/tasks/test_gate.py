@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
-from imfvla.tasks.bimanual import BimanualEnvironment
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.gate import GATE, WAYS, GateExpert
 from imfvla.tasks.gate import BAR_LENGTH
 from imfvla.tasks.props import POST_RADIUS

@@ -12,7 +12,8 @@ import numpy as np
 
 from imfvla.episode import Decision
 from imfvla.errors import UserError
-from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, BimanualTask, Pose
+from imfvla.tasks.bimanual import SIDES, BimanualTask, Pose
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.kinematics import ArmKinematics, about_z, rotation_matrix, rotation_vector
 from imfvla.tasks.robot import home_joints
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from imfvla.episode import Decision
-from imfvla.tasks.bimanual import BimanualEnvironment
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.socket import SocketExpert
 from imfvla.tasks.experts.transfer import TransferExpert
 

@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from imfvla.tasks.bimanual import SIDES, BimanualEnvironment, Pose
+from imfvla.tasks.bimanual import SIDES, Pose
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import Expert
 from imfvla.tasks.kinematics import about_z, rotation_vector
 

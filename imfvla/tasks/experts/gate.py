@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from imfvla.tasks.bimanual import BimanualEnvironment, Pose
+from imfvla.tasks.bimanual import Pose
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import CARROT_S, Expert
 from imfvla.tasks.gate import BAR_LENGTH
 from imfvla.tasks.kinematics import about_z, rotation_vector

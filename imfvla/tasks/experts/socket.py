@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from imfvla.tasks.bimanual import BimanualEnvironment, Pose
+from imfvla.tasks.bimanual import Pose
+from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import Expert
 from imfvla.tasks.kinematics import rotation_vector
 from imfvla.tasks.socket import PEG_LENGTH, SEATED, measure_fit
