@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from imfvla.errors import UserError
-from imfvla.gl import select_gl_backend
+from imfvla.gl import select_before_simulators
 from imfvla.gymnasium_env.environment import GymnasiumEnvironment
 from imfvla.gymnasium_env.options import RENDER, GymnasiumTask, read_task
-from imfvla.gymnasium_env.packages import ADAPTERS, cameras_of, import_gymnasium, register
+from imfvla.gymnasium_env.packages import cameras_of, import_gymnasium, register
 
 SLACK = 1e-4  # of limits that are written with a few digits
 TRIED_SEED = 0
@@ -23,8 +23,7 @@ def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEn
     """
     wanted = read_task(task, observation)
     gymnasium = import_gymnasium()
-    if wanted.package in ADAPTERS:
-        select_gl_backend()  # before mujoco is imported
+    select_before_simulators()
     register(wanted.package)
     draws = RENDER in (wanted.pictures[view] for view in wanted.views)
     mode = {"render_mode": "rgb_array"} if draws else {}
