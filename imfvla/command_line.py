@@ -14,7 +14,7 @@ from imfvla.errors import UserError
 # Keys of all commands whose values are names and paths, which Hydra would take for lists, choices and numbers.
 TEXTS = (
     "core.pretrained", "demos.directory", "demos.frames_directory", "demos.path", "directory",
-    "encoder.vision.pretrained", "frames_directory", "from.directory", "from.path", "hydra.run.dir", "hydra.sweep.dir",
+    "encoder.vision.pretrained", "frames_directory", "from.path", "hydra.run.dir", "hydra.sweep.dir",
     "mapping", "name", "output", "run", "to.path",
 )  # fmt: skip
 TEXTS_OR_LISTS = ("demos.path", "from.path")

@@ -12,9 +12,9 @@ from imfvla.options import Limit, build, one_of
 from imfvla.progress import Progress
 from imfvla.robot import RobotSpec
 from imfvla.sources import EpisodeArrays
+from imfvla.sources.opening import KINDS, SCRIPTED, SHARED
 
-READERS = ("lerobot", "mcap", "ros2", "hdf5")
-SHARED = ("source", "frames_directory")  # keys of conf/demos that say nothing of the data
+READERS = tuple(kind for kind in KINDS if kind != SCRIPTED)
 PATH = Limit("a path", bool)
 
 

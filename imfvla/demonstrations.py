@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from imfvla import tasks
 from imfvla.environment import Environment
-from imfvla.environments import GYMNASIUM, environment_of, kind_of
+from imfvla.environments import BIMANUAL, GYMNASIUM, KIND, environment_of, kind_of
 from imfvla.episode import Actor
 from imfvla.errors import UserError
 from imfvla.options import build, part_of, require
@@ -133,6 +133,11 @@ def settings_of(
     shown = build(ViewOptions, seen, "observation")
     if kind_of(task) == GYMNASIUM:
         return _gymnasium_settings(task, seen, camera_every, where)
+    if kind_of(task) != BIMANUAL:
+        raise UserError(
+            f"{KIND}={kind_of(task)} has no scripted expert, and so no demonstrations to collect: name recordings or a "
+            "data set with another demos=..."
+        )
     _require_frames(camera_every, tasks.TIME_LIMIT_STEPS, where)
     expert = build(ExpertOptions, part_of({"task": task}, "task.expert"), "task.expert")
     scene = build(

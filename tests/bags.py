@@ -1,7 +1,9 @@
 """Writes ROS 2 bags of a robot whose joints and pictures tell the time."""
 
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from mcap_ros2.writer import Writer
@@ -25,6 +27,15 @@ TYPES = {
     "sensor_msgs/msg/Image": HEADER.format(
         fields="uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data"
     ),
+    "foxglove_msgs/msg/CompressedVideo": """builtin_interfaces/Time timestamp
+string frame_id
+uint8[] data
+string format
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+""",
     "std_msgs/msg/Float64MultiArray": "float64[] data\n",
     "std_msgs/msg/String": "string data\n",
     "test_msgs/msg/Gripper": HEADER.format(fields="float64[2] fingers\nstring note"),
@@ -56,6 +67,11 @@ class BagWriter:
         if "Header" in TYPES[kind]:
             stamp = {"sec": taken // 10**9, "nanosec": taken % 10**9}
             message = {"header": {"stamp": stamp, "frame_id": "base"}} | message
+        if "CompressedVideo" in kind:
+            message = {
+                "timestamp": {"sec": taken // 10**9, "nanosec": taken % 10**9},
+                "frame_id": "eye",
+            } | message
         self._writer.write_message(topic, self._schemas[kind], message, log_time=time)
 
 
@@ -66,6 +82,18 @@ def grey(time_s: float, height: int = 16, width: int = 24) -> np.ndarray:
 
 def png(frame: np.ndarray) -> bytes:
     return cv2.imencode(".png", frame[..., ::-1])[1].tobytes()
+
+
+def h264(frames: list[np.ndarray]) -> list[bytes]:
+    """One packet a frame, the first a key frame, as camera drivers send them."""
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.height, encoder.width = frames[0].shape[:2]
+    encoder.pix_fmt, encoder.time_base, encoder.framerate = "yuv420p", Fraction(1, 20), 20
+    encoder.options = {"tune": "zerolatency", "crf": "10"}
+    packets = [
+        packet for frame in frames for packet in encoder.encode(av.VideoFrame.from_ndarray(frame, "rgb24"))
+    ]
+    return [bytes(packet) for packet in packets]
 
 
 def joints(time_s: float) -> dict:

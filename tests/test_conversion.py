@@ -1,11 +1,16 @@
 """python -m imfvla.convert: every source into every target, all episodes or none."""
 
+import re
+import resource
+import signal
+from importlib import import_module
+
 import numpy as np
 import pytest
 import yaml
 
 pytest.importorskip("pyarrow", reason="needs the extra lerobot")
-from outside import EEF_ACTION, EEF_STATE, ROBOT, episode, write_robomimic
+from outside import EEF_ACTION, EEF_STATE, ROBOT, episode, options, write_robomimic
 
 from imfvla import conversion
 from imfvla.command_line import in_hydras_words
@@ -42,14 +47,13 @@ def test_from_recordings_to_lerobot(data_set, tmp_path):
     main(
         [
             "from=mcap",
-            f"from.directory={tmp_path / 'recordings'}",
+            f"from.path={tmp_path / 'recordings'}",
             "to=lerobot",
             f"to.path={back}",
             "to.pictures=png",
         ]
     )
-    options = compose("convert", ["from=lerobot", "to=mcap", f"from.path={back}", "to.path=x"])["from"]
-    source = open_lerobot({key: value for key, value in options.items() if key not in conversion.SHARED})
+    source = open_lerobot(options("lerobot", path=str(back)))
     assert source.robot == ROBOT
     for index, length in enumerate(LENGTHS):
         found, made = source.episode(index, ("front", "wrist")), episode(index, length)
@@ -90,11 +94,10 @@ def test_every_source_has_its_options_in_one_place():
     for kind in conversion.READERS:
         if not (CONFIG_DIRECTORY / "demos" / f"{kind}.yaml").exists():
             continue  # comes with the source of recordings
-        place = "directory" if kind == "mcap" else "path"
         given = {"control_hz": 1, "state": "x", "action": "[x]", "layout": "act", "instruction": "x"}
         demos = yaml.safe_load((CONFIG_DIRECTORY / "demos" / f"{kind}.yaml").read_text(encoding="utf-8"))
         given = [f"from.{key}={value}" for key, value in given.items() if demos.get(key) == "???"]
-        config = compose("convert", [f"from={kind}", "to=mcap", f"from.{place}=x", "to.path=y", *given])
+        config = compose("convert", [f"from={kind}", "to=mcap", "from.path=x", "to.path=y", *given])
         assert config["from"].keys() == demos.keys()
         assert config["from"]["source"] == kind
 
@@ -119,6 +122,35 @@ def test_errors_leave_nothing(data_set, tmp_path, capsys, monkeypatch):
             main(["from=lerobot", "to=mcap", *arguments])
         assert words in capsys.readouterr().err
         assert sorted(path.name for path in tmp_path.iterdir()) == ["broken"]
+
+
+@pytest.mark.parametrize(
+    "target", [["to=mcap"], ["to=lerobot", "to.pictures=h264"], ["to=lerobot", "to.pictures=png"]]
+)
+def test_a_full_disk_leaves_nothing(data_set, tmp_path, capsys, target):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
+    try:
+        with pytest.raises(SystemExit, match="2"):
+            main(["from=lerobot", f"from.path={data_set}", f"to.path={tmp_path / 'new'}", *target])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert "too large" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["arm", "lift"])
+def test_the_examples_of_the_documents_are_right_up_to_their_paths(name):
+    text = (CONFIG_DIRECTORY.parent / "docs" / "data.md").read_text(encoding="utf-8")
+    example = yaml.safe_load(
+        re.search(rf"```yaml\n# mine/demos/{name}.yaml\n(.*?)```", text, re.DOTALL).group(1)
+    )
+    kind = example.pop("defaults")[0]
+    pytest.importorskip({"ros2": "mcap_ros2", "hdf5": "h5py"}[kind], reason=f"needs the extra {kind}")
+    with pytest.raises(UserError, match=example["path"]):
+        import_module(f"imfvla.sources.{kind}").open_source(options(kind, **example))
 
 
 def test_a_command_without_source_or_target_says_what_there_is(capsys):

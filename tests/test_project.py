@@ -81,7 +81,7 @@ def test_commands_in_documents_compose_and_build(command):
 # What a package may import of imfvla beside itself and `errors`, and which of the heavy packages.
 MAY_IMPORT = {
     "environment": {"robot"},
-    "environments": {"environment", "gymnasium_env", "options", "tasks", "views"},
+    "environments": {"construction", "environment", "gymnasium_env", "options", "tasks", "views"},
     "episode": {"environment", "robot"},
     "horizon": set(),
     "protocol": {"options"},
@@ -93,7 +93,9 @@ MAY_IMPORT = {
     "robot_of": {"environments", "options", "robot", "sources", "tasks", "views"},
     "resample": set(),
     "chunks": {"torch", "nn", "robot", "statistics"},
-    "construction": {"torch", "options"},
+    "assets": set(),
+    "components": set(),
+    "construction": {"components", "options"},
     "policy": {
         "torch",
         "chunks",
@@ -109,10 +111,22 @@ MAY_IMPORT = {
     },
     "tasks": {"mujoco", "dm_control", "environment", "episode", "gl", "options", "robot", "views"},
     "recording": {"documents", "environment", "episode", "files", "robot", "tasks"},
-    "reporting": {"documents", "episode", "files", "options", "protocol", "robot", "run_directory"},
+    "reporting": {
+        "assets",
+        "documents",
+        "episode",
+        "files",
+        "options",
+        "protocol",
+        "robot",
+        "run_directory",
+        "run_names",
+    },
+    "run_names": {"run_directory"},
     "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
     "sources": {
         "collection",
+        "construction",
         "documents",
         "episode",
         "files",

@@ -263,6 +263,13 @@ def test_a_link_out_of_the_folder_is_refused_and_one_into_the_hubs_cache_is_read
     assert len(opened(snapshot).episode(0).state) == 8
 
 
+def test_lists_that_would_fill_the_memory_are_refused_before_they_are_unpacked(copied, monkeypatch):
+    monkeypatch.setattr("imfvla.sources.lerobot.tables.MAX_GROUP_VALUES", 1000)
+    edit_table(copied / DATA, lambda columns: columns["action"].__setitem__(0, [0.0] * 2000))
+    with pytest.raises(UserError, match=r"column action.*at most 1000 values.*2057"):
+        opened(copied).episode(0)
+
+
 def test_what_the_writer_cannot_keep_is_refused(tmp_path):
     (tmp_path / "there").mkdir()
     with pytest.raises(UserError, match="exists already"):

@@ -8,7 +8,7 @@ import pytest
 from imfvla.errors import UserError
 
 pytest.importorskip("mcap_ros2", reason="needs the extra ros2")
-from bags import BagWriter, grey, joints, png, write_bag
+from bags import BagWriter, grey, h264, joints, png, write_bag
 from outside import options
 
 from imfvla.recording.mcap_file import MAGIC
@@ -131,6 +131,26 @@ def test_raw_pictures_other_messages_and_several_publishers_of_one_topic(tmp_pat
     assert source.robot.relative_to == (0, 1, 2, None)
     assert read.state[4].tolist() == pytest.approx([-0.2, 0.2, 2.0, 0.2])
     assert np.array_equal(read.images["front"][3], frame)
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_video_is_decoded_from_its_first_message_on_or_refused(tmp_path, first):
+    shades = [np.full((32, 48, 3), 20 + 10 * tick, np.uint8) for tick in range(21)]
+    packets = h264(shades)
+    assert len(packets) == len(shades)
+    with BagWriter(tmp_path / "bag.mcap") as bag:
+        for tick in range(first, 21):
+            bag.write("/joint_states", "sensor_msgs/msg/JointState", tick / 20, joints(tick / 20))
+            video = {"data": packets[tick], "format": "h264"}
+            bag.write("/video", "foxglove_msgs/msg/CompressedVideo", tick / 20 + 0.3, video, delay_s=0.3)
+    if first:
+        with pytest.raises(UserError, match=r"bag\.mcap.*/video.*key frame"):
+            opened(tmp_path / "bag.mcap", cameras={"front": "/video"})
+        return
+    source = opened(tmp_path / "bag.mcap", cameras={"front": "/video"}, camera_every=4)
+    read = source.episode(0, ("front",))
+    assert (source.robot.cameras[0].height, source.robot.cameras[0].width) == (32, 48)
+    assert np.abs(read.images["front"].astype(int) - np.stack(shades)[:20:4]).max() <= 4
 
 
 def test_the_clock_can_be_the_time_of_recording(tmp_path):

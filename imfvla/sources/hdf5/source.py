@@ -79,9 +79,9 @@ class Hdf5Source:
 
     def __init__(self, options: Options, where: str) -> None:
         self._options, self._where, self._layout = options, where, LAYOUTS[options.layout]
-        self._files = _files(Path(options.path), where)
         self._state = _state(options.state, f"{where}.state")
         self._action = channels(options.action, f"{where}.action", need_units=True)
+        self._files = _files(Path(options.path), where)
         places = list(self._places())
         self._places_chosen = [
             places[number] for number in chosen_episodes(options.episodes, len(places), options.path, where)

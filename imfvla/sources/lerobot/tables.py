@@ -21,6 +21,7 @@ except ImportError as error:
 BATCH = 1024  # rows in memory at a time
 MAX_TASKS, MAX_SENTENCE = 100_000, 10_000
 MAX_ROW_BYTES = 2 * 2**30  # of the rows of one episode
+MAX_GROUP_VALUES = 2**28  # of a column of a row group: a list of equal numbers takes no space in the file
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +142,7 @@ def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -
             if row < last and row + num_rows > first:
                 skip = skip if groups else first - row
                 groups.append(group)
+                _check_group(file.metadata.row_group(group), columns, path)
             row += num_rows
         left, num_bytes = last - first, 0
         for batch in file.iter_batches(BATCH, row_groups=groups, columns=list(columns), use_threads=False):
@@ -154,6 +156,18 @@ def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -
                 yield table.select(list(columns))
             if left <= 0:
                 return
+
+
+def _check_group(group: pq.RowGroupMetaData, columns: Sequence[str], path: Path) -> None:
+    """Raises UserError where a column would fill the memory when it is unpacked."""
+    for number in range(group.num_columns):
+        column = group.column(number)
+        name = next((name for name in columns if f"{column.path_in_schema}.".startswith(f"{name}.")), None)
+        if name is not None and column.num_values > MAX_GROUP_VALUES:
+            wanted = f"at most {MAX_GROUP_VALUES} values in a row group"
+            raise misfit(
+                path, f"column {name}", wanted, column.num_values, "rewrite the file in smaller row groups"
+            )
 
 
 def vectors(table: pa.Table, name: str, width: int, path: Path) -> np.ndarray:

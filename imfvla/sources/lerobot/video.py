@@ -28,6 +28,10 @@ def read_frames(path: Path, times_s: np.ndarray, fps: float, size: tuple[int, in
             if not container.streams.video:
                 raise misfit(path, "its streams", "a video", "none", DOWNLOAD)
             stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise misfit(
+                    path, "its codec", "one that av decodes (others are not supported)", "another", DOWNLOAD
+                )
             found = (stream.codec_context.height, stream.codec_context.width)
             if found != size:
                 raise misfit(
@@ -43,7 +47,7 @@ def read_frames(path: Path, times_s: np.ndarray, fps: float, size: tuple[int, in
         raise
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing: wanted a video there; {DOWNLOAD}.") from error
-    except (av.FFmpegError, OSError, ValueError) as error:
+    except (av.FFmpegError, OSError, ValueError, TypeError, ArithmeticError) as error:
         raise UserError(f"{path} is no whole mp4 ({shortened(str(error))}); {DOWNLOAD}.") from error
     return frames
 

@@ -9,7 +9,8 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.sources.checks import shortened
 from imfvla.sources.ros2.bag import Bag, Received, received, topics_of
-from imfvla.sources.ros2.fields import Part, picture
+from imfvla.sources.ros2.eye import Eye
+from imfvla.sources.ros2.fields import Part
 from imfvla.sources.ros2.resample import Series
 
 MAX_MESSAGES = 10_000_000  # of one topic
@@ -47,12 +48,13 @@ def read_bag(
 
     Raises UserError where a topic is missing, of a type that does not fit, or has numbers that are not finite.
     """
-    times: dict[str, array] = {}
+    times: dict[str, array] = {view: array("q") for view in wanted.cameras}
     values = {part: (array("q"), array("d")) for part in wanted.parts}
-    sizes: dict[str, tuple[int, int]] = {}
+    eyes = {view: Eye() for view in wanted.cameras}
+    if shots is not None:
+        eyes = {view: Eye(shots[view], pictures[view]) for view in shots}
     others: dict[Part, Received] = {}  # messages with other joints
     texts: dict[str, list[tuple[int, str]]] = {topic: [] for topic in wanted.texts}
-    places = {view: _places(numbers) for view, numbers in (shots or {}).items()}
     topics = {part.topic for part in wanted.parts} | set(wanted.cameras.values()) | set(wanted.texts)
     for message in received(bag, topics):
         for part in wanted.parts:
@@ -66,20 +68,17 @@ def read_bag(
                 _check_number(len(values[part][0]), message)
         for view, topic in wanted.cameras.items():
             if topic == message.topic:
-                taken = times.setdefault(view, array("q"))
-                if shots is None and view not in sizes:
-                    sizes[view] = picture(message).shape[:2]
-                for place in places.get(view, {}).get(len(taken), ()):
-                    pictures[view][place] = _fitting(picture(message), pictures[view].shape[1:], message)
-                taken.append(_time(message, message.stamp(), wanted))
-                _check_number(len(taken), message)
+                if view in eyes:
+                    eyes[view].see(message, len(times[view]))
+                times[view].append(_time(message, message.stamp(), wanted))
+                _check_number(len(times[view]), message)
         if message.topic in texts:
             texts[message.topic].append((message.log_time, _text(message)))
     for part, message in others.items():
         if not values[part][0]:
             raise part.unfit(message)
     missing = [part.topic for part in wanted.parts if not values[part][0]]
-    missing += [topic for view, topic in wanted.cameras.items() if view not in times]
+    missing += [topic for view, topic in wanted.cameras.items() if not times[view]]
     if missing:
         known = shortened(
             ", ".join(f"{topic} ({kind})" for topic, kind in topics_of(bag).items()) or "none", 600
@@ -88,20 +87,14 @@ def read_bag(
             f"{bag.files[0]}: wanted messages of {', '.join(dict.fromkeys(missing))}, found the topics {known}; "
             "correct the topics in the options, or leave this bag out."
         )
+    for eye in eyes.values():
+        eye.end()
     return Contents(
         {part: _sorted(part, *found) for part, found in values.items()},
         {view: Series.of(wanted.cameras[view], taken) for view, taken in times.items()},
-        sizes,
+        {view: eye.size for view, eye in eyes.items() if eye.size is not None},
         texts,
     )
-
-
-def _places(numbers: np.ndarray) -> dict[int, list[int]]:
-    """Message -> places among the pictures; one picture can be the nearest of several steps."""
-    found: dict[int, list[int]] = {}
-    for place, number in enumerate(numbers.tolist()):
-        found.setdefault(number, []).append(place)
-    return found
 
 
 def _sorted(part: Part, times: array, flat: array) -> tuple[Series, np.ndarray]:
@@ -127,12 +120,3 @@ def _check_number(number: int, message: Received) -> None:
         raise UserError(
             f"{message.file}: {message.topic} must have at most {MAX_MESSAGES} messages, found more; split the bag."
         )
-
-
-def _fitting(frame: np.ndarray, shape: tuple[int, ...], message: Received) -> np.ndarray:
-    if frame.shape != shape:
-        raise UserError(
-            f"{message.file}: pictures of {message.topic} must be {shape[0]} x {shape[1]}, as the first of all, "
-            f"found {frame.shape[0]} x {frame.shape[1]}; leave this bag out."
-        )
-    return frame

@@ -147,8 +147,8 @@ def picture(message: Received) -> np.ndarray:
     """uint8 (H, W, 3) of an Image or a CompressedImage. Raises UserError where its kind or encoding is another."""
     if message.kind not in (IMAGE, COMPRESSED):
         raise UserError(
-            f"{message.file}: {message.topic} must have sensor_msgs/msg/Image or CompressedImage (others are not "
-            f"supported), found {message.kind}; record or republish it as one of them."
+            f"{message.file}: {message.topic} must have sensor_msgs/msg/Image, CompressedImage or foxglove's "
+            f"CompressedVideo (others are not supported), found {message.kind}; record or republish it as one of them."
         )
     decoded = message.decode()
     if message.kind == COMPRESSED:

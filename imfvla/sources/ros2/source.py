@@ -3,14 +3,13 @@
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from imfvla.errors import UserError
-from imfvla.options import above, at_least, build, one_of, within
-from imfvla.robot import MAX_CONTROL_HZ, Camera, RobotSpec
+from imfvla.options import build
+from imfvla.robot import Camera, RobotSpec
 from imfvla.sources.base import EpisodeArrays
 from imfvla.sources.checks import (
     action_range,
@@ -23,40 +22,10 @@ from imfvla.sources.checks import (
 from imfvla.sources.ros2.bag import Bag, find_bags
 from imfvla.sources.ros2.contents import Contents, Wanted, read_bag
 from imfvla.sources.ros2.fields import Part
+from imfvla.sources.ros2.options import Marks, Options, read_cameras, read_parts, read_paths
 from imfvla.sources.ros2.resample import Steps, common_steps, largest_gap_s, last_before, nearest
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """Texts of a topic between which episodes lie."""
-
-    topic: str
-    start: str
-    stop: str
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """What conf/demos/ros2.yaml documents."""
-
-    path: Any  # a path or a list of paths
-    episodes: tuple[Annotated[int, at_least(0)], ...] | None
-    control_hz: Annotated[float, above(0), within(0, MAX_CONTROL_HZ)]
-    state: Any  # entries of `Part`
-    action: Any  # the same, or null
-    cameras: Any  # view -> topic
-    absolute: tuple[str, ...] | None
-    action_min: tuple[float, ...] | None
-    action_max: tuple[float, ...] | None
-    camera_every: Annotated[int, at_least(1)]
-    instruction: str | None
-    instruction_topic: str | None
-    marks: Any  # of `Marks`, or null
-    clock: Annotated[str, one_of("stamp", "log")]
-    max_gap_s: Annotated[float, above(0)]
-    max_skew_s: Annotated[float, above(0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +47,13 @@ class Ros2Source:
 
     def __init__(self, options: Options, where: str) -> None:
         self._options, self._where = options, where
-        self._state = _parts(options.state, f"{where}.state")
-        self._action = None if options.action is None else _parts(options.action, f"{where}.action")
+        self._state = read_parts(options.state, f"{where}.state")
+        self._action = None if options.action is None else read_parts(options.action, f"{where}.action")
         self._marks = None if options.marks is None else build(Marks, options.marks, f"{where}.marks")
         texts = (options.instruction_topic, self._marks and self._marks.topic)
         self._wanted = Wanted(
             tuple(dict.fromkeys((*self._state, *(self._action or ())))),
-            _cameras(options.cameras, where),
+            read_cameras(options.cameras, where),
             tuple(dict.fromkeys(topic for topic in texts if topic)),
             options.clock == "stamp",
         )
@@ -93,7 +62,7 @@ class Ros2Source:
                 f"{where}.instruction must be a sentence, found null: write what the robot does, or name the topic "
                 f"that says it in {where}.instruction_topic."
             )
-        self._bags = find_bags(_paths(options.path, where), where)
+        self._bags = find_bags(read_paths(options.path, where), where)
         self._plans, self._sizes = self._planned()
         self.robot = self._spec()
 
@@ -158,7 +127,7 @@ class Ros2Source:
                 f"{self._marks.topic}; correct its texts."
             )
         numbers = chosen_episodes(
-            chosen, len(found), ", ".join(map(str, _paths(self._options.path, ""))), self._where
+            chosen, len(found), ", ".join(map(str, read_paths(self._options.path, ""))), self._where
         )
         plans = [found[number] for number in numbers]
         names = [plan.name for plan in plans]
@@ -279,31 +248,6 @@ def _between(texts: Sequence[tuple[int, str]], marks: Marks, bag: Bag) -> Sequen
             "found none; correct the bag or leave it out."
         )
     return found
-
-
-def _parts(entries: Any, key: str) -> tuple[Part, ...]:
-    if not isinstance(entries, list | tuple) or not entries:
-        raise UserError(
-            f"{key} must be a list of entries with topic and channels, found {shortened(entries)}: "
-            "see conf/demos/ros2.yaml."
-        )
-    return tuple(Part.read(entry, f"{key}[{number}]") for number, entry in enumerate(entries))
-
-
-def _cameras(views: Any, where: str) -> dict[str, str]:
-    fits = isinstance(views, Mapping) and all(isinstance(topic, str) for topic in views.values())
-    if not fits:
-        raise UserError(f"{where}.cameras must be a mapping of views to topics, found {shortened(views)}.")
-    return {str(view): topic for view, topic in views.items()}
-
-
-def _paths(path: Any, where: str) -> list[str]:
-    paths = [path] if isinstance(path, str | Path) else path
-    if not isinstance(paths, list | tuple) or not all(
-        isinstance(one, str | Path) and str(one) for one in paths
-    ):
-        raise UserError(f"{where}.path must be a path or a list of paths, found {shortened(path)}.")
-    return list(map(str, paths))
 
 
 def open_source(options: Mapping[str, Any], *, where: str = "demos") -> Ros2Source:
