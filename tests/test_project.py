@@ -146,7 +146,7 @@ MAY_IMPORT = {
         "tasks",
         "views",
     },
-    "gymnasium_env": {"dm_control", "environment", "episode", "gl", "options", "robot", "views"},
+    "gymnasium_env": {"assets", "dm_control", "environment", "episode", "gl", "options", "robot", "views"},
     "modes": {
         "torch",
         "collection",

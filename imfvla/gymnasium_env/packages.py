@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from imfvla.assets import install_command
 from imfvla.errors import UserError
 
 GROUPS = ("imfvla.components", "gymnasium.envs")
-INSTALL = "pip install -c constraints.txt -e '.[gym]'"
 INSTALL_PUSHT = "pip install --no-deps gym-pusht==0.1.8"  # the extra has what else it needs
 # module -> the module here that adapts its environments
 ADAPTERS = {"gym_aloha": "imfvla.gymnasium_env.aloha", "gym_pusht": "imfvla.gymnasium_env.pusht"}
@@ -42,7 +42,9 @@ def import_gymnasium() -> Any:
     try:
         return import_module("gymnasium")
     except ModuleNotFoundError as error:
-        raise UserError(f"task.kind=gymnasium needs the package gymnasium: run `{INSTALL}`.") from error
+        raise UserError(
+            f"task.kind=gymnasium needs the package gymnasium: run `{install_command('gym')}`."
+        ) from error
 
 
 def register(package: str | None) -> None:
@@ -62,7 +64,7 @@ def register(package: str | None) -> None:
         import_module(package)
     except ImportError as error:
         raise UserError(
-            f"task.package={package} cannot be imported ({error}): run `{INSTALL}`, for gym_pusht also "
+            f"task.package={package} cannot be imported ({error}): run `{install_command('gym')}`, for gym_pusht also "
             f"`{INSTALL_PUSHT}`."
         ) from error
 
