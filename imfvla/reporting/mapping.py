@@ -102,7 +102,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """All tables, their rows and the comparisons, each in its order; `tasks` are those that figures always show."""
+    """All tables, their rows and the comparisons, each in its order; `tasks` have titles."""
 
     tasks: tuple[TaskTitle, ...]
     tables: tuple[TableTitle, ...]
