@@ -12,7 +12,7 @@ TASK ?= socket
 EPISODES ?= 4
 ARGS ?=
 
-SHIPPED := experiments/pretrained/$(TASK)_ph32_exec16
+SHIPPED := experiments/pretrained/$(TASK)_ph32_exec16/generator=imf_plain
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check

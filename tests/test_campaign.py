@@ -121,7 +121,9 @@ def test_a_whole_name_means_that_policy_alone():
 
 
 def test_a_name_that_fits_nothing_is_reported_with_those_there_are():
-    with pytest.raises(UserError, match=r"--only knitting matches none .*: socket_ph32_exec16/generator=imf_plain, "):
+    with pytest.raises(
+        UserError, match=r"--only knitting matches none .*: socket_ph32_exec16/generator=imf_plain, "
+    ):
         TOOL.policies("campaign", "knitting")
 
 

@@ -257,8 +257,8 @@ def begins_first(command: Path) -> bool:
 @pytest.mark.parametrize(
     "left",
     [
-        "pretrained/socket_ph32_exec16/table_row.md",
-        "pretrained/socket_ph32_exec16/rollouts/seeds100000-100099_nfe4/summary.json",
+        "pretrained/socket_ph32_exec16/generator=imf_plain/table_row.md",
+        "pretrained/socket_ph32_exec16/generator=imf_plain/rollouts/seeds100000-100099_nfe4/summary.json",
         "results/socket_act/default/table_row.json",
         "report/index.html",
     ],

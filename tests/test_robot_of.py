@@ -63,7 +63,7 @@ def test_a_wrongly_stated_robot_is_named_with_its_key():
 @pytest.mark.parametrize("name", MEAN_BEFORE)
 def test_a_shipped_policy_gives_the_chunks_that_it_gave(name):
     """Its config states the sizes that are now handed in; with and without them it is the same policy, bit for bit."""
-    run = RunDirectory(SHIPPED / name)
+    run = RunDirectory(SHIPPED / name / "generator=imf_plain")
     old = run.config()
     assert old["state_dim"] == old["core"]["channels"] == 16
     new = {key: value for key, value in old.items() if key not in ("state_dim", "action_dim")} | with_robot(
@@ -91,7 +91,10 @@ def test_a_shipped_policy_gives_the_chunks_that_it_gave(name):
 def test_committed_runs_do_not_differ_from_their_configs_of_today():
     """Keys that follow from the robot are no differences, so that finished runs are not done again."""
     for name in MEAN_BEFORE:
-        old, new = RunDirectory(SHIPPED / name).config(), compose("train", [f"+exp={name}"])
+        old, new = (
+            RunDirectory(SHIPPED / name / "generator=imf_plain").config(),
+            compose("train", [f"+exp={name}", "generator=imf_plain"]),
+        )
         differing = {text.split()[0] for text in differences(old, new, EXECUTION_KEYS)}
         assert not differing & {"demos.source", *DERIVED_KEYS}
     assert all(

@@ -1,6 +1,6 @@
 """Plays one episode of a trained policy and writes its Attention Residual weights, for the figures of make tables.
 
-python tools/depth_attention.py experiments/pretrained/socket_ph32_exec16
+python tools/depth_attention.py experiments/pretrained/socket_ph32_exec16/generator=imf_plain
 
 Writes depth_attention.json into the run directory: the mean weights of each sublayer over all tokens and decisions.
 """

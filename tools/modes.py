@@ -1,6 +1,6 @@
 """Draws samples of a trained policy at recorded observations and says what they are, beside the demonstrations.
 
-python tools/modes.py experiments/pretrained/transfer_ph32_exec16 --nfe 1 2 3
+python tools/modes.py experiments/pretrained/transfer_ph32_exec16/generator=imf_plain --nfe 1 2 3
 
 Without --demos the expert plays 30 starts of the band for choosing, into outputs/modes. Prints one table: when grippers
 close and in which order, samples between modes, dependence on the noise, jumps between consecutive chunks.

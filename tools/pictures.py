@@ -144,7 +144,7 @@ def rollouts() -> np.ndarray:
     """Episodes of the shipped policies."""
     rows = []
     for task, seed, text in ROLLOUTS:
-        played, result = _played(SHIPPED / f"{task}_ph32_exec16", seed)
+        played, result = _played(SHIPPED / f"{task}_ph32_exec16" / "generator=imf_plain", seed)
         outcome = "success" if result.success else "failure"
         rows.append((f"Start {seed}, {text}: {outcome}", played.pictures))
     return contact_sheet(rows, TIMES)

@@ -1,6 +1,6 @@
 """Copies what is needed to evaluate a finished run elsewhere, and how it was made, into a small directory.
 
-python tools/ship_policy.py runs/socket_ph32_exec16/default experiments/pretrained/socket_ph32_exec16
+python tools/ship_policy.py runs/socket_act/default experiments/pretrained/socket_act/default
 python tools/ship_policy.py --without-weights runs/socket_act/default experiments/results/socket_act/default
 
 Taken are the config, the last averaged weights, the metrics of every 10th logged step and the episodes and summaries

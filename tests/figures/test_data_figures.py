@@ -67,7 +67,7 @@ def test_the_frontier_is_what_nothing_beats_in_both():
 def test_printed_values_and_ours_are_in_panels_of_their_own(results):
     paper, ours = reward_latency(of_table(results, "table1")).axes
     assert len(paper.texts) == 7
-    assert len(ours.texts) == 15
+    assert len(ours.texts) == 18
     assert "3" in [text.get_text() for text in paper.texts]
 
 
@@ -120,7 +120,7 @@ def test_changes_of_a_method_share_its_panel(tmp_path):
             write_evaluation(run, nfe, number=100, **protocol)
     found = [Result(evaluated) for evaluated in Sources([tmp_path]).others([])]
     panel, *_ = success_by_evaluations(found).axes
-    assert panel.get_title(loc="left") == "iMF-AttnRes"
+    assert panel.get_title(loc="left") == "iMF-AttnRes, two stages"
     labels = sorted(bars.get_label() for bars in panel.containers)
     assert labels == ["as in the tables", "chunks from no noise", "unimodal demonstrations"]
 

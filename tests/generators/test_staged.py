@@ -175,7 +175,7 @@ def test_one_step_needs_weights_of_the_second_stage():
     gen.begin_step(Core(), 1, 4)
     gen.check_nfe(2)
     with pytest.raises(
-        UserError, match=r"nfe=1 follows the average velocity.* in the last 25%.*checkpoint=last"
+        UserError, match=r"nfe=1 follows the average velocity.* in the last 25%.*Take later weights"
     ):
         gen.check_nfe(1)
     gen.begin_step(Core(), 3, 4)

@@ -18,6 +18,7 @@ def open_all(folder: str, file: str) -> None:
     items = [data[index] for index in range(len(data))]
     np.savez(
         file,
+        allow_pickle=False,
         tasks=np.array([item["task"] for item in items]),
         fps=data.fps,
         action_is_pad=np.stack([item["action_is_pad"].numpy() for item in items]),

@@ -77,7 +77,7 @@ def test_we_read_what_lerobot_wrote(tmp_path):
     for number, made in enumerate(episodes):
         arrays |= {f"state{number}": made.state, f"action{number}": made.action}
         arrays |= {f"{view}{number}": frames for view, frames in made.images.items()}
-    np.savez(tmp_path / "made.npz", **arrays)
+    np.savez(tmp_path / "made.npz", allow_pickle=False, **arrays)
     lerobot("write", tmp_path / "made.npz", tmp_path / "sets")
     for kind, most in (("video", CODEC_ERROR), ("image", 0)):
         source = open_source(options("lerobot", path=str(tmp_path / "sets" / kind)))

@@ -223,7 +223,13 @@ def test_mistakes_in_loading_are_named(arguments, message):
 
 @pytest.mark.parametrize("name", ["socket", "transfer"])
 def test_committed_evaluations_began_where_their_seeds_begin_now(name):
-    run = Path(__file__).parents[2] / "experiments" / "pretrained" / f"{name}_ph32_exec16"
+    run = (
+        Path(__file__).parents[2]
+        / "experiments"
+        / "pretrained"
+        / f"{name}_ph32_exec16"
+        / "generator=imf_plain"
+    )
     lines = next(run.glob("rollouts/*/episodes.jsonl")).read_text().splitlines()
     env = tasks.load(name)
     for row in map(json.loads, lines[:3]):
