@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from imfvla.command_line import in_hydras_words
 from imfvla.composition import compose
 from imfvla.policy import build_policy
 
@@ -73,7 +74,7 @@ def test_commands_in_documents_compose_and_build(command):
     # Of a sweep, the first choice of each key.
     overrides = [re.sub(r"^(?!nfe=)([^=]+=[^,]+),.*$", r"\1", text) for text in arguments if "=" in text]
     overrides = [re.sub(r"^nfe=(.*)$", r"nfe=[\1]", text) for text in overrides]
-    config = compose(entry, overrides)
+    config = compose(entry, in_hydras_words(overrides))
     if entry == "train":
         build_policy(config)
 
