@@ -7,6 +7,7 @@ from typing import Any
 from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.table import Table, number
 
+SAME_STEP = {"generator=imf_plain"}  # overrides that leave the network and its steps as they are
 PARTS_OF_A_STEP = ("data", "encoder", "core", "jvp", "backward", "optimiser")
 MOST_OF_PARTS = 1.15  # a chunk may cost this multiple of its encoder and calls of the core
 NORMAL_95 = 1.96  # half a 95% interval in standard errors
@@ -90,14 +91,15 @@ def speed_ratios(
 ) -> dict[str, dict[str, float | str]]:
     """By printed comparison of Table 3: median times of both chunks [ms], their ratio with interval, the paper's.
 
-    `latencies` are of the experiments in conf/exp without overrides; other comparisons are left out.
+    `latencies` are of the experiments in conf/exp without overrides; rows whose overrides change what is computed in a
+    step are left out.
     """
     found: dict[str, dict[str, float | str]] = {}
     for comparison in comparisons:
         times = [
             latencies.get(row.experiment, {}).get(f"infer{row.nfe}")
             for row in (comparison.baseline, comparison.row)
-            if not row.overrides
+            if set(row.overrides) <= SAME_STEP
         ]
         if comparison.of in SPEEDS and len(times) == 2 and all(times):
             slow, fast = (time["median_ms"] for time in times if time)

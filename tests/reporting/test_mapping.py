@@ -57,7 +57,7 @@ def test_a_checkpoint_is_a_share_of_the_training():
         ("nfe: 2 }", "nfe: two }", r"line \d+, table1, row 4\.nfe must be a whole number, found 'two'"),
         ("checkpoint: 1/3", "checkpoint: 4/3", r"line \d+, table1, row 1: checkpoint must be last or a share"),
         ("ACT (action chunking)", "ACT (chunks)", r"row 6: unknown row of the paper's Table 1 'ACT \(chunks\)'"),
-        ("row: socket_imf_infer3", "row: socket_imf_infer4", r"table3, row 1: unknown row 'socket_imf_infer4' \(did"),
+        ("row: socket_infer3", "row: socket_infer4", r"table3, row 1: unknown row 'socket_infer4' \(did you mean"),
         ("name: socket_act", "name: socket_infer1", r"row 6: the name socket_infer1 is taken by .*row 1"),
         ("as: ratio }", "as: quotient }", r"table3, row 1: as must be ratio or"),
         ("of: avg_return", "of: reward", r"table3, row 1: of must be avg_return or"),
