@@ -1,9 +1,15 @@
-"""Ranges and moments to which normalisers are fitted."""
+"""Ranges and moments to which normalisers are fitted.
+
+Shapes: T control steps of an episode, K decisions, W windows, Tp predicted steps, S state, A action.
+"""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
+
+MOST_BLOCK = 64  # steps that a block of `_correlation` has at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +52,116 @@ class Statistics:
     def from_json(cls, lists: Mapping[str, list]) -> "Statistics":
         """Inverse of `to_json`."""
         return cls(**{name: np.asarray(values, np.float32) for name, values in lists.items()})
+
+
+class RunningStatistics:
+    """`Statistics` of episodes that are added one after the other, in memory that does not grow with their number.
+
+    Sums are float64, over values less those of the first episode's first step, so that little is lost where
+    deviations are small beside means. A displacement's square is summed as a^2 - 2 a s + s^2, of which only the
+    product of action and earlier state depends on pairs of steps; `_correlation` has it as products of matrices.
+    """
+
+    def __init__(self, origin: np.ndarray, pred: int) -> None:
+        """`origin` (A,): of each action the state channel that it is displaced from; `pred`: Tp."""
+        self._origin, self._pred = origin, pred
+        self._steps: tuple[_StepSums, _StepSums] | None = None
+        self._count = np.zeros(pred, np.int64)  # windows whose step is valid
+        self._sum, self._square = np.zeros((2, pred, len(origin)))
+
+    def add(self, state: np.ndarray, action: np.ndarray, decisions: np.ndarray) -> None:
+        """An episode of states (T, S) and actions (T, A), with windows at the steps `decisions` (K,), ascending."""
+        if self._steps is None:
+            self._steps = _StepSums(state[0]), _StepSums(action[0])
+            self._usual = action[0].astype(np.float64) - state[0, self._origin]
+        state, action = (np.ascontiguousarray(rows.T, np.float64) for rows in (state, action))
+        for sums, rows in zip(self._steps, (state, action), strict=True):
+            sums.add(rows)
+        decided = np.zeros(action.shape[1])
+        decided[decisions] = 1
+        start = state[self._origin, :1]  # any value, subtracted from both, keeps the products small
+        state = (state[self._origin] - start) * decided
+        action = action - start - self._usual[:, None]
+        number = _suffix_sums(decided[None, ::-1], self._pred)[0]  # those that lie j steps before the end
+        self._count += number.astype(np.int64)
+        self._sum += (_ahead(decided, action, self._pred) - _suffix_sums(state[:, ::-1], self._pred)).T
+        squares = _ahead(decided, np.square(action), self._pred)
+        squares += _suffix_sums(np.square(state)[:, ::-1], self._pred)
+        self._square += (squares - 2 * _correlation(state, action, self._pred)).T
+
+    def result(self) -> Statistics:
+        """Of all episodes so far, at least one. A step that is never valid has mean and deviation 0."""
+        assert self._steps is not None
+        number = np.maximum(self._count, 1)[:, None]
+        mean = self._sum / number
+        deviation = np.sqrt(np.maximum(self._square / number - np.square(mean), 0))
+        mean = np.where(self._count[:, None] > 0, mean + self._usual, 0)
+        moments = (moment for sums in self._steps for moment in sums.moments())
+        return Statistics(*moments, mean.astype(np.float32), deviation.astype(np.float32))
+
+
+class _StepSums:
+    """Of the rows of one array, whose first row is `first` (C,)."""
+
+    def __init__(self, first: np.ndarray) -> None:
+        self._first = first.astype(np.float64)
+        self._low, self._high = self._first, self._first
+        self._count, self._sum, self._square = 0, np.zeros(len(first)), np.zeros(len(first))
+
+    def add(self, rows: np.ndarray) -> None:
+        """`rows` float64 (C, T)."""
+        self._low, self._high = (
+            np.minimum(self._low, rows.min(axis=1)),
+            np.maximum(self._high, rows.max(axis=1)),
+        )
+        rows = rows - self._first[:, None]
+        self._count += rows.shape[1]
+        self._sum += rows.sum(axis=1)
+        self._square += np.square(rows).sum(axis=1)
+
+    def moments(self) -> tuple[np.ndarray, ...]:
+        """Lowest, highest, mean and deviation, float32 (C,)."""
+        mean = self._sum / self._count
+        deviation = np.sqrt(np.maximum(self._square / self._count - np.square(mean), 0))
+        found = (self._low, self._high, self._first + mean, deviation)
+        return tuple(moment.astype(np.float32) for moment in found)
+
+
+def _suffix_sums(values: np.ndarray, count: int) -> np.ndarray:
+    """Sums of values (C, T) from steps 0, 1, ... `count` - 1 to the end: (C, count), 0 where there is no such step."""
+    sums = np.zeros((len(values), count))
+    found = values[:, ::-1].cumsum(axis=1)[:, ::-1][:, :count]
+    sums[:, : found.shape[1]] = found
+    return sums
+
+
+def _ahead(decided: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Sums over the steps where `decided` (T,) is 1 of the values (C, T) j steps later: (C, count)."""
+    if decided.all():
+        return _suffix_sums(values, count)
+    return _correlation(np.broadcast_to(decided, values.shape), values, count)
+
+
+def _correlation(early: np.ndarray, late: np.ndarray, count: int) -> np.ndarray:
+    """Sums over t of early[:, t] * late[:, t + j] for j below `count`, past the end 0: (C, T) each to (C, count).
+
+    Cut into blocks of steps, these are diagonals of the product of two matrices for each channel.
+    """
+    channels, steps = early.shape
+    size = min(count, MOST_BLOCK)
+    blocks, width = -(-steps // size), size + count
+    left = np.zeros((channels, blocks * size))
+    left[:, :steps] = early
+    right = np.zeros((channels, blocks * size + count))
+    right[:, :steps] = late
+    strides = right.strides
+    right = as_strided(right, (channels, blocks, width), (strides[0], size * strides[1], strides[1]))
+    products = left.reshape(channels, blocks, size).transpose(0, 2, 1) @ np.ascontiguousarray(right)
+    strides = products.strides
+    diagonals = as_strided(
+        products, (channels, size, count), (strides[0], strides[1] + strides[2], strides[2])
+    )
+    return diagonals.sum(axis=1)
 
 
 def _moments(rows: np.ndarray) -> tuple[np.ndarray, ...]:
