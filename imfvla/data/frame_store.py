@@ -109,15 +109,15 @@ class FrameStore:
         store_path = Path(store_path)
         for view in views:
             source.robot.camera(view)
-        meta = _meta(source, tuple(views), tuple(image_size))
+        meta = meta_of(source, tuple(views), tuple(image_size))
         with locked(store_path):
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
 
 
-def _meta(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
-    """What a store is made from; its digest shows whether the store is up to date."""
+def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
+    """What a store is made from, as in its meta.json; the digest shows whether the store is up to date."""
     content = json.dumps([FORMAT, views, image_size, source.digest()])
     return {
         "format": FORMAT,
