@@ -130,8 +130,8 @@ class _StepSums:
 def _suffix_sums(values: np.ndarray, count: int) -> np.ndarray:
     """Sums of values (C, T) from steps 0, 1, ... `count` - 1 to the end: (C, count), 0 where there is no such step."""
     sums = np.zeros((len(values), count))
-    found = values[:, ::-1].cumsum(axis=1)[:, ::-1][:, :count]
-    sums[:, : found.shape[1]] = found
+    first = values[:, :count]
+    sums[:, : first.shape[1]] = values.sum(axis=1, keepdims=True) - first.cumsum(axis=1) + first
     return sums
 
 

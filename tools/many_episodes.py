@@ -6,8 +6,8 @@ python tools/many_episodes.py --episodes 1000
 Writes a frame store of drawn episodes with black pictures of 8 x 8 pixels, which take no disk space. Then a fresh
 process for each number of episodes does what a training does until its first step: opens the store, fits the
 normalisers, builds the policy, takes a batch. Prints the time of this from the start of the process, imports included,
-and of the parts; the peak of its resident memory, and without the pages of the store's files, which the system can
-drop; the median time of preparing a batch.
+and the processor's time, of the whole and of its parts; the peak of its resident memory, and without the pages of the
+store's files, which the system can drop; the median time of preparing a batch.
 """
 
 from imfvla.command import as_command, begin
@@ -62,7 +62,7 @@ class Drawn:
 
 
 def prepare(episodes: int, folder: Path) -> tuple[dict[str, Any], Drawn, dict[str, float]]:
-    """The config of a training, the episodes, and the seconds that importing what it needs took."""
+    """The config of a training, the episodes, and the time that importing what it needs took."""
     parts: dict[str, float] = {}
     with timed(parts, "imports"):
         from imfvla.composition import compose
@@ -128,7 +128,7 @@ def start(episodes: int, folder: Path, began: float) -> dict[str, Any]:
         "parameters": sum(parameter.numel() for parameter in policy.parameters()),
         "start_s": round(whole, 2),
         "start_cpu_s": round(computed, 2),
-        "parts_s": {name: round(seconds, 2) for name, seconds in parts.items()},
+        "parts_cpu_s": {name: round(seconds, 2) for name, seconds in parts.items()},
         "peak_mib": round(resident / MIB),
         "peak_without_store_mib": round((resident - mapped) / MIB),
         "batch_ms": round(float(np.median(taken)), 3),
@@ -137,9 +137,10 @@ def start(episodes: int, folder: Path, began: float) -> dict[str, Any]:
 
 @contextmanager
 def timed(parts: dict[str, float], name: str) -> Iterator[None]:
-    began = time.perf_counter()
+    """Adds the processor's time of a part, which other processes on the machine change little."""
+    began = time.process_time()
     yield
-    parts[name] = time.perf_counter() - began
+    parts[name] = time.process_time() - began
 
 
 def peak() -> int:
