@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-MOST_BLOCK = 64  # steps that a block of `_correlation` has at most
+MOST_BLOCK = 64  # steps that a block of `_Correlation` has at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ class RunningStatistics:
 
     Sums are float64, over values less those of the first episode's first step, so that little is lost where
     deviations are small beside means. A displacement's square is summed as a^2 - 2 a s + s^2, of which only the
-    product of action and earlier state depends on pairs of steps; `_correlation` has it as products of matrices.
+    product of action and earlier state depends on pairs of steps; `_Correlation` has it as products of matrices.
     """
 
     def __init__(self, origin: np.ndarray, pred: int) -> None:
@@ -67,7 +67,9 @@ class RunningStatistics:
         self._origin, self._pred = origin, pred
         self._steps: tuple[_StepSums, _StepSums] | None = None
         self._count = np.zeros(pred, np.int64)  # windows whose step is valid
-        self._sum, self._square = np.zeros((2, pred, len(origin)))
+        self._sum, self._square = np.zeros((2, len(origin), pred))
+        # What is missing in these two sums: of actions and their squares after decisions, of action times state.
+        self._sparse, self._sparse_square, self._crossed = (_Correlation(len(origin), pred) for _ in range(3))
 
     def add(self, state: np.ndarray, action: np.ndarray, decisions: np.ndarray) -> None:
         """An episode of states (T, S) and actions (T, A), with windows at the steps `decisions` (K,), ascending."""
@@ -81,23 +83,29 @@ class RunningStatistics:
         decided[decisions] = 1
         start = state[self._origin, :1]  # any value, subtracted from both, keeps the products small
         state = (state[self._origin] - start) * decided
-        action = action - start - self._usual[:, None]
-        number = _suffix_sums(decided[None, ::-1], self._pred)[0]  # those that lie j steps before the end
-        self._count += number.astype(np.int64)
-        self._sum += (_ahead(decided, action, self._pred) - _suffix_sums(state[:, ::-1], self._pred)).T
-        squares = _ahead(decided, np.square(action), self._pred)
-        squares += _suffix_sums(np.square(state)[:, ::-1], self._pred)
-        self._square += (squares - 2 * _correlation(state, action, self._pred)).T
+        action = action - (start + self._usual[:, None])
+        # Of a decision, the step j steps later is valid if the decision lies so far before the end.
+        self._count += _suffix_sums(decided[None, ::-1], self._pred)[0].astype(np.int64)
+        self._sum -= _suffix_sums(state[:, ::-1], self._pred)
+        self._square += _suffix_sums(np.square(state)[:, ::-1], self._pred)
+        self._crossed.add(state, action)
+        if len(decisions) == len(decided):
+            self._sum += _suffix_sums(action, self._pred)
+            self._square += _suffix_sums(np.square(action), self._pred)
+        else:
+            self._sparse.add(decided, action)
+            self._sparse_square.add(decided, np.square(action))
 
     def result(self) -> Statistics:
         """Of all episodes so far, at least one. A step that is never valid has mean and deviation 0."""
         assert self._steps is not None
-        number = np.maximum(self._count, 1)[:, None]
-        mean = self._sum / number
-        deviation = np.sqrt(np.maximum(self._square / number - np.square(mean), 0))
-        mean = np.where(self._count[:, None] > 0, mean + self._usual, 0)
+        number = np.maximum(self._count, 1)
+        mean = (self._sum + self._sparse.sums()) / number
+        square = (self._square + self._sparse_square.sums() - 2 * self._crossed.sums()) / number
+        deviation = np.sqrt(np.maximum(square - np.square(mean), 0))
+        mean = np.where(self._count > 0, mean + self._usual[:, None], 0)
         moments = (moment for sums in self._steps for moment in sums.moments())
-        return Statistics(*moments, mean.astype(np.float32), deviation.astype(np.float32))
+        return Statistics(*moments, mean.T.astype(np.float32), deviation.T.astype(np.float32))
 
 
 class _StepSums:
@@ -135,33 +143,35 @@ def _suffix_sums(values: np.ndarray, count: int) -> np.ndarray:
     return sums
 
 
-def _ahead(decided: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Sums over the steps where `decided` (T,) is 1 of the values (C, T) j steps later: (C, count)."""
-    if decided.all():
-        return _suffix_sums(values, count)
-    return _correlation(np.broadcast_to(decided, values.shape), values, count)
-
-
-def _correlation(early: np.ndarray, late: np.ndarray, count: int) -> np.ndarray:
-    """Sums over t of early[:, t] * late[:, t + j] for j below `count`, past the end 0: (C, T) each to (C, count).
+class _Correlation:
+    """Sums over episodes and steps t of early[:, t] * late[:, t + j] for j below `count`, with 0 past the end.
 
     Cut into blocks of steps, these are diagonals of the product of two matrices for each channel.
     """
-    channels, steps = early.shape
-    size = min(count, MOST_BLOCK)
-    blocks, width = -(-steps // size), size + count
-    left = np.zeros((channels, blocks * size))
-    left[:, :steps] = early
-    right = np.zeros((channels, blocks * size + count))
-    right[:, :steps] = late
-    strides = right.strides
-    right = as_strided(right, (channels, blocks, width), (strides[0], size * strides[1], strides[1]))
-    products = left.reshape(channels, blocks, size).transpose(0, 2, 1) @ np.ascontiguousarray(right)
-    strides = products.strides
-    diagonals = as_strided(
-        products, (channels, size, count), (strides[0], strides[1] + strides[2], strides[2])
-    )
-    return diagonals.sum(axis=1)
+
+    def __init__(self, channels: int, count: int) -> None:
+        self._count, self._size = count, min(count, MOST_BLOCK)
+        # The product has its own memory: the system takes as long to hand it out each time as to compute it.
+        self._products, self._sum = np.zeros((2, channels, self._size, self._size + count))
+
+    def add(self, early: np.ndarray, late: np.ndarray) -> None:
+        """An episode's values, float64 (C, T) each; `early` may broadcast to it."""
+        (channels, steps), size = late.shape, self._size
+        blocks = -(-steps // size)
+        left = np.zeros((channels, blocks * size))
+        left[:, :steps] = early
+        right = np.zeros((channels, blocks * size + self._count))
+        right[:, :steps] = late
+        shape = channels, blocks, size + self._count
+        right = as_strided(right, shape, (right.strides[0], size * right.strides[1], right.strides[1]))
+        left = left.reshape(channels, blocks, size).transpose(0, 2, 1)
+        self._sum += np.matmul(left, np.ascontiguousarray(right), out=self._products)
+
+    def sums(self) -> np.ndarray:
+        """float64 (C, count)."""
+        channel, row, column = self._sum.strides
+        shape = len(self._sum), self._size, self._count
+        return as_strided(self._sum, shape, (channel, row + column, column)).sum(axis=1)
 
 
 def _moments(rows: np.ndarray) -> tuple[np.ndarray, ...]:
