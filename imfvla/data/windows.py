@@ -56,10 +56,11 @@ class Windows:
 
     def batch(self, indices: np.ndarray, rng: np.random.Generator) -> Batch:
         """The windows `indices` (B,), each with one of its episode's sentences drawn by `rng`."""
-        episodes, steps = self.decisions(indices)
+        frame = self._frame[indices]
+        episodes, steps = self._episode_of(frame), self.store.image_steps[frame]
         seen = self.horizon.observed_steps(steps)
         # All of these steps have frames, so that as many frames lie between two of them as steps.
-        frames = self._frame[indices][:, None] + seen - steps[:, None]
+        frames = (frame - steps)[:, None] + seen
         images = np.take(self.store.images, frames.reshape(-1), axis=0)
         sentences = self._first_sentence[episodes] + rng.integers(self._num_sentences[episodes])
         observation = Observation(
