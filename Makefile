@@ -18,7 +18,7 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery wheel test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
@@ -65,6 +65,11 @@ report: setup  ## Make them in experiments/report, with videos and recordings: a
 gallery: setup  ## Write pictures of every view of the tasks
 	for task in socket transfer either_arm gate; do $(PY) -m imfvla.gallery task=$$task $(ARGS); done
 
+wheel: $(INSTALLED)  ## Build dist/imfvla-*.whl, which works from any directory
+	rm -rf build dist
+	$(PIP) wheel --no-build-isolation --no-deps -w dist .
+	rm -rf build
+
 test: setup  ## Run the tests on two processes (ARGS="tests/tasks -k seed")
 	OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 $(ARGS)
 
@@ -73,10 +78,10 @@ lint: $(INSTALLED)  ## Check style and format with ruff
 	$(PY) -m ruff format --check .
 
 clean:  ## Remove .venv and caches; runs/ and data/ stay
-	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "imfvla needs Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); name one: make setup PYTHON=python3.11" >&2; \
 	  exit 1; }

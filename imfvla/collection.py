@@ -5,24 +5,22 @@ import logging
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from imfvla import tasks
+from imfvla.demonstrations import Settings, settings_of
 from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
-from imfvla.environments import BIMANUAL, KIND, environment_of, kind_of
 from imfvla.errors import UserError
 from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
-from imfvla.options import Limit, at_least, build, one_of, part_of, require, within
+from imfvla.options import Limit, at_least, build, one_of, part_of, within
 from imfvla.progress import Progress
 from imfvla.protocol import DEMONSTRATION_SEEDS, MAX_WORKERS, demonstration_seeds
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.rollout import run_episode
-from imfvla.views import ViewOptions
 
 LOG_NAME = "collection.json"
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
@@ -48,39 +46,6 @@ class DemoOptions:
     camera_every: Annotated[int, at_least(1)]
     workers: Annotated[int, within(0, MAX_WORKERS)] | None
     source: Annotated[str, one_of("scripted")] = "scripted"  # of imfvla.sources.opening
-
-
-@dataclass(frozen=True, slots=True)
-class SceneOptions:
-    """Which task is demonstrated; see `imfvla.tasks.load`. Only this package's own tasks have scripted experts."""
-
-    name: str
-    variant: str
-
-
-@dataclass(frozen=True, slots=True)
-class ExpertOptions:
-    """How the expert demonstrates; see `imfvla.tasks.experts.Expert`."""
-
-    modes: int
-    noise: float
-    hold: int
-    dwell: int
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What the content of a folder of demonstrations depends on beside the seeds. Hashable, sent to the workers."""
-
-    task: str
-    variant: str
-    modes: int
-    noise: float
-    hold: int
-    dwell: int
-    views: tuple[str, ...]
-    image_size: tuple[int, int]
-    camera_every: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +89,7 @@ def collect(
     # Reports what cannot be simulated before anything is written.
     _stage_for(settings)
     began = time.perf_counter()
-    name = folder_name(settings)
+    name = settings.folder
     directory = Path(options.directory) / name
     with locked(directory):  # other jobs of a sweep may need the same demonstrations
         listed = _Log(directory, settings)
@@ -146,36 +111,9 @@ def read_settings(
     task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str
 ) -> tuple[DemoOptions, Settings]:
     """The checked options of a collection; `where` is the group of `demos` in messages. Raises UserError."""
-    if kind_of(task) != BIMANUAL:
-        raise UserError(
-            f"{KIND}={kind_of(task)} has no scripted expert, and so no demonstrations to collect: name recordings or a "
-            "data set with another demos=..."
-        )
     options = build(DemoOptions, demos, where)
-    most = tasks.TIME_LIMIT_STEPS
     key = f"{where}.camera_every".lstrip(".")
-    require(
-        options.camera_every <= most,
-        key,
-        f"between 1 and {most}, the steps of an episode",
-        options.camera_every,
-    )
-    expert = build(ExpertOptions, part_of({"task": task}, "task.expert"), "task.expert")
-    seen = {
-        key: part_of({"observation": observation}, f"observation.{key}") for key in ("views", "image_size")
-    }
-    shown = build(ViewOptions, seen, "observation")
-    scene = build(
-        SceneOptions, {key: part_of({"task": task}, f"task.{key}") for key in ("name", "variant")}, "task"
-    )
-    settings = Settings(
-        task=scene.name,
-        variant=scene.variant,
-        **asdict(expert),
-        **asdict(shown),
-        camera_every=options.camera_every,
-    )
-    return options, settings
+    return options, settings_of(task, observation, options.camera_every, key)
 
 
 def _record_missing(
@@ -231,7 +169,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     # A temporary name until it has succeeded: a kill must not leave a failed episode under the final one.
     trial = path.with_suffix(".mcap.trial")
     sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
-    result = run_episode(env, expert, seed, [sink], kind="demonstration", config=asdict(settings))
+    result = run_episode(env, expert, seed, [sink], kind="demonstration", config=settings.to_json())
     with clear_write_errors(path):
         if result.success:
             trial.replace(path)
@@ -242,17 +180,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
 
 @lru_cache(maxsize=1)
 def _stage_for(settings: Settings) -> tuple[Any, Any]:
-    from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
-
-    env = environment_of(
-        {
-            "task": {"name": settings.task, "variant": settings.variant},
-            "observation": {"views": settings.views, "image_size": settings.image_size},
-        }
-    )
-    return env, make_expert(
-        settings.task, modes=settings.modes, noise=settings.noise, hold=settings.hold, dwell=settings.dwell
-    )
+    return settings.build()
 
 
 class _Log:
@@ -265,7 +193,7 @@ class _Log:
         self._path = directory / LOG_NAME
         self._remedy = f"choose another demos.directory, or move {directory} away to record it again"
         env, _ = _stage_for(settings)
-        self._settings = json.loads(json.dumps(asdict(settings))) | {"model": env.model_digest()}
+        self._settings = json.loads(json.dumps(settings.to_json())) | {"model": env.model_digest()}
         self.failed: set[int] = set()
         is_empty = next(directory.glob("episode-*.mcap"), None) is None
         if self._path.exists():
@@ -303,13 +231,6 @@ class _Log:
         write_json(self._path, {"settings": self._settings, "failed_seeds": sorted(self.failed)})
 
 
-def folder_name(settings: Settings) -> str:
-    """The folder of demonstrations with these settings."""
-    height, width = settings.image_size
-    waiting = f"-dwell{settings.dwell}" if settings.dwell else ""
-    return f"{settings.task}-{settings.variant}-modes{settings.modes}{waiting}-{height}x{width}"
-
-
 def recording_path(directory: Path, seed: int) -> Path:
     """Where a folder has the demonstration of `seed`."""
     return directory / f"episode-{seed:06d}.mcap"
@@ -341,8 +262,7 @@ def _is_recorded(directory: Path, seed: int, settings: Settings) -> bool:
     except TruncatedRecording:
         return False
     found = (info.kind, info.task, info.seed, info.views, sizes_of(info.robot))
-    size = settings.image_size
-    wanted = ("demonstration", settings.task, seed, settings.views, (size,) * len(settings.views))
+    wanted = ("demonstration", settings.task, seed, settings.views, settings.sizes)
     if found != wanted:
         raise UserError(
             f"{path} must hold kind, task, seed, views and their sizes {wanted}, found {found}: its file was "

@@ -13,10 +13,11 @@ from imfvla.errors import UserError
 
 # Keys of all commands whose values are names and paths, which Hydra would take for lists, choices and numbers.
 TEXTS = (
-    "core.pretrained", "demos.directory", "demos.frames_directory", "directory", "encoder.vision.pretrained",
-    "frames_directory", "hydra.run.dir", "hydra.sweep.dir",
-    "mapping", "name", "output", "run",
+    "core.pretrained", "demos.directory", "demos.frames_directory", "demos.path", "directory",
+    "encoder.vision.pretrained", "frames_directory", "from.path", "hydra.run.dir", "hydra.sweep.dir",
+    "mapping", "name", "output", "run", "to.path",
 )  # fmt: skip
+TEXTS_OR_LISTS = ("demos.path", "from.path")
 LISTS_OF_TEXTS = ("directories", "runs")
 LISTS_OF_NUMBERS = ("nfe", "evaluation.nfe")
 # Hydra's own flags that would be ignored or would bypass what a command does around a job, with the alternative.
@@ -88,6 +89,8 @@ def _in_hydras_words(argument: str, is_sweep: bool) -> str:
     if name in LISTS_OF_NUMBERS and not is_sweep and re.fullmatch(r"\d+(,\d+)+", value):
         return f"{key}=[{value}]"
     if not equals or name not in (*TEXTS, *LISTS_OF_TEXTS):
+        return argument
+    if name in TEXTS_OR_LISTS and value.startswith("[") and not os.path.exists(value):
         return argument
     if name in TEXTS:
         return f"{key}={_text(value, is_sweep)}"

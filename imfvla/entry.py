@@ -19,7 +19,7 @@ from imfvla import composition
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command
 from imfvla.command_line import in_hydras_words, multiplies, refuse_ignored
 from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
-from imfvla.jobs import Failure, Job
+from imfvla.jobs import Failure, HydraJob
 from imfvla.sweep import IsFinished, names_a_sweep, run_sweep
 
 
@@ -42,7 +42,7 @@ def entry_point(
         @wraps(function)
         def main(argv: Sequence[str] | None = None) -> None:
             arguments = list(sys.argv[1:] if argv is None else argv)
-            code = _run(Job(function, config_name), arguments, is_finished, usage)
+            code = _run(HydraJob(function, config_name), arguments, is_finished, usage)
             if code:
                 sys.exit(code)
 
@@ -58,7 +58,7 @@ def output_directory() -> Path:
 
 @as_command
 def _run(
-    job: Job, arguments: list[str], is_finished: IsFinished | None, usage: Callable[[], str] | None
+    job: HydraJob, arguments: list[str], is_finished: IsFinished | None, usage: Callable[[], str] | None
 ) -> int:
     composition.register_resolvers()
     known = get_args_parser().parse_intermixed_args(arguments)
@@ -69,12 +69,12 @@ def _run(
     if os.environ.get("RANK", "0") != "0":  # torchrun's: of several processes the first one writes
         known.overrides.append("hydra/job_logging=disabled")
     arguments = [*flags, *known.overrides]  # Hydra rejects overrides on both sides of a flag
+    more = Path(known.config_dir).absolute() if known.config_dir else None
     try:
         with _hydra_raises(arguments):
             refuse_ignored(known, is_sweep)
             if usage and is_bare:
                 raise UserError(usage())
-            more = Path(known.config_dir).absolute() if known.config_dir else None
             composition.refuse_added_keys(job.config_name, known.overrides, more)
             if is_sweep:
                 failures = run_sweep(job, known.overrides, is_finished, more)
@@ -82,7 +82,7 @@ def _run(
                 _run_once(job)
                 failures = [job.failure] if job.failure else []
     except (HydraException, OmegaConfBaseException) as error:
-        raise composition.explain(error, job.config_name, known.overrides) from error
+        raise composition.explain(error, job.config_name, known.overrides, more) from error
     except (OSError, ValueError) as error:  # ours, and of what Hydra itself writes: directories, train.log
         if (known_error := as_user_error(error, REMEDIES | WHERE_MISSING)) is None:
             raise
@@ -90,8 +90,8 @@ def _run(
     return _report(failures)
 
 
-def _run_once(job: Job) -> None:
-    path = str(composition.CONFIG_DIRECTORY)
+def _run_once(job: HydraJob) -> None:
+    path = str(composition.config_directory())
     hydra.main(config_path=path, config_name=job.config_name, version_base=composition.VERSION_BASE)(job)()
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from imfvla.collection import check_demonstrations
-from imfvla.composition import EXECUTION_KEYS
 from imfvla.data.held_out import held_out
 from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.errors import UserError
@@ -26,7 +25,7 @@ from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.offline import print_offline
 from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
-from imfvla.run_directory import DONE, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
 from imfvla.same_robot import refuse_other_robot
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source

@@ -11,6 +11,7 @@ from typing import Any
 import psutil
 
 import imfvla
+from imfvla import components
 
 CPU_FLAGS = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16", "amx_tile")
 PACKAGES = (
@@ -35,7 +36,8 @@ def fingerprint(**extra: Any) -> dict[str, Any]:
 def code_version() -> dict[str, Any]:
     """Version, commit and whether files differ from it (dirty); the last two are None outside a clone."""
     root = Path(imfvla.__file__).resolve().parents[1]
-    commit = _git(root, "rev-parse", "HEAD")
+    # From a wheel the environment itself may lie in the repository of another project.
+    commit = _git(root, "rev-parse", "HEAD") if (root / ".git").exists() else None
     changes = _git(root, "status", "--porcelain", "--untracked-files=no") if commit else None
     return {
         "version": imfvla.__version__,
@@ -69,13 +71,13 @@ def machine() -> dict[str, Any]:
 
 @cache
 def packages() -> dict[str, str]:
-    """Installed versions of the packages that results depend on."""
+    """Installed versions of the packages that results depend on, and of those that register components."""
     installed = {
         dist.metadata["Name"].lower(): dist.version
         for dist in metadata.distributions()
         if dist.metadata["Name"]
     }
-    return {name: installed[name] for name in PACKAGES if name in installed}
+    return {name: installed[name] for name in PACKAGES if name in installed} | components.packages()
 
 
 def physical_cores() -> int:

@@ -33,7 +33,7 @@ class Failure:
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)
 
 
-class Job:
+class HydraJob:
     """Hydra's task function around `function(config)`: plain config in, None or a Failure out.
 
     Launchers send it to other processes by pickle; there it registers the configs' resolvers again.

@@ -133,7 +133,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
             core=construct(
                 config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
             ),
-            generator=construct(config["generator"], "generator"),
+            generator=construct(config["generator"], "generator", Generator),
         )
     except KeyError as error:
         raise UserError(
@@ -141,11 +141,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
         ) from None
     except UserError:
         raise
-    except Exception as error:  # hydra wraps what a constructor raises
-        reason = error.__cause__ or error
-        if isinstance(reason, UserError):
-            raise reason from None
-        raise UserError(f"the configured policy cannot be built: {reason_of(reason)}") from error
+    except Exception as error:  # parts that a constructor took can be unusable together
+        raise UserError(f"the configured policy cannot be built: {reason_of(error)}") from error
     wanted, found = policy.generator.core_interface, policy.core.interface
     if wanted != found:
         raise UserError(

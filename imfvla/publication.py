@@ -23,6 +23,7 @@ from imfvla.reporting.mapping import Mapping as RowMapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import offline_table, read_offline
 from imfvla.reporting.page import Picture, page
+from imfvla.reporting.published import published_rows
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import find_runs, key_of
 from imfvla.reporting.table import Table
@@ -116,7 +117,8 @@ def _formats(document: Document) -> dict[str, str]:
 def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> Document:
     if table.of == COMPARISONS:
         return comparison_table(table.title, compare(mapping.comparisons, results))
-    return row_table(table.title, [result for result in results if result.row.table == table.name])
+    rows = [result for result in results if result.row.table == table.name]
+    return row_table(table.title, rows, published=published_rows(table.task))
 
 
 def _figures(

@@ -13,14 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import initialize_config_dir
 from hydra._internal.callbacks import Callbacks
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
-from hydra.core.config_search_path import SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -32,11 +28,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from imfvla import composition
 from imfvla.errors import UserError
-from imfvla.jobs import Failure, Job
+from imfvla.jobs import Failure, HydraJob
 from imfvla.options import build, is_whole, require
 from imfvla.progress import Progress
 from imfvla.reporting.mapping import LAST, TableRow, read_mapping
 from imfvla.run_directory import EXECUTION_KEYS, differences
+from imfvla.run_names import key_of
 
 GROUP = "sweep"
 LOOK_EVERY_S = 5.0  # seconds between looks at what jobs in other processes have finished
@@ -64,11 +61,11 @@ class Planned:
 
 def names_a_sweep(overrides: Sequence[str]) -> bool:
     """Whether there is a `+sweep=NAME` among the overrides."""
-    return any(composition.key_of(text) == GROUP for text in overrides)
+    return any(key_of(text) == GROUP for text in overrides)
 
 
 def run_sweep(
-    job: Job, overrides: Sequence[str], is_finished: IsFinished | None, more: Path | None = None
+    job: HydraJob, overrides: Sequence[str], is_finished: IsFinished | None, more: Path | None = None
 ) -> list[Failure]:
     """Runs the jobs that are not finished and returns what failed; one failure stops no other job.
 
@@ -106,15 +103,9 @@ def _composed(
     config_name: str, overrides: Sequence[str], with_log_configuration: bool, more: Path | None = None
 ) -> Iterator[tuple[ConfigLoader, DictConfig, list[str]]]:
     """Hydra's loader, the config that all jobs have in common, and the overrides that name sweeps."""
-    directory = str(composition.config_directory())
-    with initialize_config_dir(directory, version_base=composition.VERSION_BASE, job_name=config_name):
-        hydra = GlobalHydra.instance().hydra
-        if more is not None:
-            search_path = hydra.config_loader.get_search_path()
-            search_path.prepend("command-line", f"file://{more}", SearchPathQuery(provider="schema"))
-            hydra.config_loader = ConfigLoaderImpl(search_path)  # which lists its sources when it is made
-        common = [text for text in overrides if composition.key_of(text) != GROUP]
-        chosen = [text for text in overrides if composition.key_of(text) == GROUP]
+    with composition.configs(config_name, more) as hydra:
+        common = [text for text in overrides if key_of(text) != GROUP]
+        chosen = [text for text in overrides if key_of(text) == GROUP]
         master = hydra.compose_config(config_name, common, RunMode.MULTIRUN, with_log_configuration)
         yield hydra.config_loader, master, chosen
 
@@ -128,7 +119,9 @@ def plan(loader: ConfigLoader, master: DictConfig, chosen: Sequence[str]) -> lis
     common = [*_params_of(master), *master.hydra.overrides.task]
     files = [name for override in parser.parse_overrides(list(chosen)) for name in _names(override)]
     config_name = master.hydra.job.config_name
-    lists = [job for name in files for job in _jobs_of_file(loader, config_name, name)] if files else [()]
+    places = composition.searched(OmegaConf.to_container(master.hydra.overrides.hydra))
+    lists = [job for name in files for job in _jobs_of_file(loader, config_name, name, places)]
+    lists = lists if files else [()]
     products = [BasicSweeper.split_arguments(parser.parse_overrides([*own, *common]), None) for own in lists]
     every = dict.fromkeys(tuple(job) for (product,) in products for job in product)
     planned = [_planned(loader, master, job) for job in every]
@@ -283,9 +276,11 @@ def _names(override: Override) -> list[str]:
     return [override.get_value_element_as_str()]
 
 
-def _jobs_of_file(loader: ConfigLoader, config_name: str, name: str) -> list[tuple[str, ...]]:
-    config = loader.load_configuration(config_name, [f"+{GROUP}={name}"], RunMode.RUN)
-    where = f"conf/{GROUP}/{name}.yaml"
+def _jobs_of_file(
+    loader: ConfigLoader, config_name: str, name: str, places: Sequence[str]
+) -> list[tuple[str, ...]]:
+    config = loader.load_configuration(config_name, [*places, f"+{GROUP}={name}"], RunMode.RUN)
+    where = f"{GROUP}/{name}.yaml"
     read = build(SweepOptions, OmegaConf.to_container(config[GROUP]), where)
     known = [table.name for table in read_mapping().of_rows]
     require({*read.tables} <= {*known}, f"{where}: tables", f"a list from {', '.join(known)}", read.tables)

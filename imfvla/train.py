@@ -21,7 +21,7 @@ def usage() -> str:
     names = ", ".join(sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml")))
     return (
         f"Name an experiment: python -m imfvla.train +exp=NAME [key=value ...]. There are {names}. Any other override "
-        "works too: task=transfer trains on that task with the options of conf/train.yaml. --help shows all keys."
+        "works too: task=transfer trains on that task without a named experiment. --help shows all keys."
     )
 
 

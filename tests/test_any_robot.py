@@ -15,7 +15,7 @@ from imfvla.training.checkpoint import load_policy
 
 SHAPES = ((7, 7), (8, 9), (14, 14), (20, 23))  # actions, states
 TINY = [
-    "task=none", "demos=mcap", "demos.directory=none", "task.held_out=1", "observation.image_size=[16,16]",
+    "task=none", "demos=mcap", "demos.path=none", "task.held_out=1", "observation.image_size=[16,16]",
     "size.width=20", "size.heads=2", "size.depth=1", "horizon.pred=8", "horizon.exec=4", "training.batch_size=2",
     "training.steps=2", "training.checkpoints=1", "training.threads=1", "evaluation.nfe=[1,2]",
 ]  # fmt: skip
@@ -81,7 +81,8 @@ def test_a_robot_of_any_shape_is_trained_stored_loaded_and_moved(
 
 
 @pytest.mark.parametrize(
-    "core", ["core=act generator=act evaluation.nfe=[1]", "core=smolvla encoder=smolvla/cpu"]
+    "core",
+    ["core=act generator=act evaluation.nfe=[1]", "core=smolvla encoder=smolvla/cpu generator=smolvla"],
 )
 def test_other_cores_take_their_sizes_from_the_robot_too(trained, core):
     robot = robot_of_size(8, 9, num_cameras=2)

@@ -31,7 +31,7 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
         [
             "parts=[simulation,training,latency]", "at_scale=cpu",
             "experiments=[transfer_ph32_exec16]", "nfe=[1,3]", "training_steps=1", "latency_calls=5",
-            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in TOY)}]",
+            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in (*TOY, 'generator=imf_plain'))}]",
         ]
     )  # fmt: skip
     out = capsys.readouterr().out
@@ -100,7 +100,8 @@ def test_every_kind_of_core_has_its_size_and_its_latency(experiment):
     config = compose("train", [f"+exp={experiment}", *seen, "core.width=20", "core.depth=2"])
     size = measure_size(config, [1])
     assert 0 < size["core_evaluation_gflop"] < size["chunk_gflop"]["infer1"]
-    latency = measure_latency(FakeEnvironment(), build_unfitted(config), [1], calls=2, warm_up=1)
+    policy = build_unfitted(config)
+    latency = measure_latency(FakeEnvironment(robot=policy.robot), policy, [1], calls=2, warm_up=1)
     assert latency["infer1"]["core_evaluation_ms"] > 0
 
 

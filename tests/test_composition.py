@@ -1,17 +1,17 @@
 import pytest
 
-from imfvla.composition import MAX_RUN_NAME, compose, run_name
+from imfvla.composition import compose
 from imfvla.errors import UserError
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["+exp=nope"], r"Unknown exp 'nope': conf/exp has .*socket_ph32_exec16, .*transfer_ph32_exec16"),
+        (["+exp=nope"], r"Unknown exp 'nope': there are .*socket_ph32_exec16, .*transfer_ph32_exec16"),
         (["+exp=socket_ph32_exec1"], r"did you mean socket_ph32_exec16\?"),
         (["exp=socket_ph32_exec16"], r"write \+exp=socket_ph32_exec16 instead of exp=socket_ph32_exec16"),
         (["+epx=socket_ph32_exec16"], r"Unknown key epx: at the top are .*training"),
-        (["task=chess"], r"Unknown task 'chess': conf/task has .*socket, transfer"),
+        (["task=chess"], r"Unknown task 'chess': there are .*socket, transfer"),
         (["traning.steps=3"], r"Unknown key traning\.steps \(did you mean training\?\): at the top are"),
         (
             ["training.stps=3"],
@@ -43,26 +43,3 @@ def test_command_line_wins_over_experiment_over_scale():
     assert config["task"]["name"] == "transfer"
     assert config["observation"]["image_size"] == [224, 224]
     assert config["training"]["batch_size"] == 3
-
-
-@pytest.mark.parametrize(
-    ("overrides", "name"),
-    [
-        ([], "default"),
-        (["+exp=socket_ph32_exec16", "name=x"], "default"),
-        (["evaluation.nfe=[1]", "training.threads=1", "demos.workers=1"], "default"),
-        (["seed=1", "horizon.pred=8"], "horizon.pred=8,seed=1"),
-        (["horizon.pred=8", "seed=1"], "horizon.pred=8,seed=1"),
-        (["observation.views=[front, top]"], "observation.views=front,top"),
-        (["demos.episodes=../../x"], "demos.episodes=..-..-x"),
-        (["encoder=a/b:c"], "encoder=a-b-c"),
-    ],
-)
-def test_run_names(overrides, name):
-    assert run_name(overrides) == name
-
-
-def test_long_run_names_are_cut_and_stay_apart():
-    names = {run_name([f"core.something_long={'x' * 200}{number}"]) for number in range(3)}
-    assert len(names) == 3
-    assert all(len(name) <= MAX_RUN_NAME for name in names)

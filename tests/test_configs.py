@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from any_robot import MemorySource
 from synthetic import write_demonstrations
 
 from imfvla.composition import CONFIG_DIRECTORY, compose
@@ -17,6 +18,7 @@ from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.protocol import EvaluationOptions
 from imfvla.reporting.mapping import read_mapping
+from imfvla.robot_of import robot_of
 from imfvla.run_directory import RunDirectory
 from imfvla.sources.mcap import McapSource
 from imfvla.training.checkpoint import load_policy
@@ -40,6 +42,13 @@ TINY = [
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory) -> Path:
     return write_demonstrations(tmp_path_factory.mktemp("recorded") / "demonstrations", num_episodes=2)
+
+
+def source_of(config: dict, demonstrations: Path):
+    """Recordings of the two arms, or drawn episodes of another robot."""
+    if "kind" in config["task"]:
+        return MemorySource(robot_of(config), num_episodes=2)
+    return McapSource.of(demonstrations)
 
 
 def test_every_row_of_the_tables_has_its_experiment():
@@ -81,9 +90,9 @@ def test_the_reading_of_each_printed_row_is_that_of_its_config(row):
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, tmp_path, monkeypatch):
-    config = compose("train", [f"+exp={experiment}", *TINY])
-    windows = prepare_windows(config, McapSource.of(demonstrations))
-    run = RunDirectory(tmp_path)
+    config = compose("train", [f"+exp={experiment}", *TINY, f"demos.frames_directory={tmp_path}/frames"])
+    windows = prepare_windows(config, source_of(config, demonstrations))
+    run = RunDirectory(tmp_path / "run")
     run.claim(config)
 
     def trainer() -> Trainer:
@@ -117,6 +126,8 @@ def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, 
     nfe = config["evaluation"]["nfe"][-1]
     assert torch.equal(policy.predict(obs, noise, nfe), policy.predict(obs, noise, nfe))
 
+    if package := config["task"].get("package"):
+        pytest.importorskip(package, reason=f"{package} is not installed")
     few = {"episodes": 1, "first_seed": 0, "workers": 0, "max_steps": 2, "recordings": False}
     (summary,) = evaluate(run, EvaluationOptions(nfe=(config["evaluation"]["nfe"][0],), **few))
     assert summary["checkpoint_step"] == 2
@@ -128,8 +139,9 @@ def interrupt() -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations):
-    tiny = prepare_windows(compose("train", [f"+exp={experiment}", *TINY]), McapSource.of(demonstrations))
+def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations, tmp_path):
+    small = compose("train", [f"+exp={experiment}", *TINY, f"demos.frames_directory={tmp_path}/frames"])
+    tiny = prepare_windows(small, source_of(small, demonstrations))
     config = compose("train", [f"+exp={experiment}", "scale=paper"])
     build(TrainingOptions, config["training"], "training")
     policy = build_policy(config, tiny.statistics())

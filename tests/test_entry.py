@@ -123,7 +123,7 @@ def test_train_command_reports_a_mistake_in_one_line(tmp_path):
     )
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.startswith("Unknown exp 'nope': conf/exp has ")
+    assert done.stderr.startswith("Unknown exp 'nope': there are ")
     assert done.stderr.count("\n") == 1
 
 

@@ -10,6 +10,7 @@ from fakes import PlainEnvironment
 from imfvla.environments import environment_of
 from imfvla.errors import UserError
 from imfvla.robot_of import robot_of
+from imfvla.tasks.catalogue import NAMES
 
 SEEN = {"views": ["front"], "image_size": [16, 16]}
 
@@ -32,7 +33,7 @@ def test_a_kind_names_who_builds_the_environment(monkeypatch):
         (
             {"name": "knitting", "variant": "easy"},
             SEEN,
-            "task.name must be one of combined, socket, transfer",
+            f"task.name must be one of {', '.join(sorted(NAMES))}",
         ),
         ({"name": "socket"}, SEEN, "Missing key task.variant"),
         ({"name": "socket", "variant": "easy"}, {"views": ["front"]}, "Missing key observation.image_size"),

@@ -112,7 +112,7 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("evaluation.episodes=0", r"evaluation\.episodes must be between 1 and"),
         ("core=block_attnres core.residual.block_size=9", r"block_size .* 8 sublayers of the core, found 9"),
         ("generator=act core=act evaluation.nfe=[3]", r"must be 1 with generator=act .*, found 3"),
-        ("core=act", r"generator .*ImprovedMeanFlow drives .* core .*ActCore is of the kind"),
+        ("core=act", r"generator .*MeanFlow drives .* core .*ActCore is of the kind"),
         ("generator.parametrisation=x", r"generator\.parametrisation must be data or velocity"),
         ("evaluation.device=gpu", r"evaluation\.device must be one of cpu, cuda, found 'gpu'"),
         ("evaluation.device=cuda", r"evaluation\.device must be cpu, as torch finds no CUDA device"),

@@ -47,6 +47,43 @@ def test_without_a_sweep_the_other_folder_is_looked_in_too(mine, tmp_path):
     assert seen(tmp_path) == ["mine 0"]
 
 
+@pytest.mark.parametrize("by", [[], ["-m"], ["+sweep=pair"]])
+def test_configs_of_the_search_path_are_found_alone_and_in_sweeps(mine, tmp_path, by):
+    (tmp_path / "more" / "sweep").mkdir()
+    (tmp_path / "more" / "sweep" / "pair.yaml").write_text("tables: []\njobs: [['+own=a', 'seed=5,6']]\n")
+    (tmp_path / "more" / "own").mkdir()
+    (tmp_path / "more" / "own" / "a.yaml").write_text("# @package _global_\nname: of_own_group\n")
+    group = [] if by == ["+sweep=pair"] else ["+own=a", "seed=5,6" if by else "seed=5"]
+    command([*by, f"hydra.searchpath=[file://{mine}]", *group])
+    assert seen(tmp_path) == ["of_own_group 5", "of_own_group 6"][: 2 if by else 1]
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("file://nowhere", "hydra.searchpath names 'file://nowhere', which is not a directory"),
+        ("pkg://no_such_package.conf", "names 'pkg://no_such_package.conf', which is not a package"),
+        ("http://x", "hydra.searchpath takes file://DIR and pkg://NAME, found 'http://x'"),
+    ],
+)
+def test_a_place_that_does_not_exist_is_refused(tmp_path, capfd, place, message):
+    for more in ([], ["-m"]):
+        with pytest.raises(SystemExit) as exit_:
+            command([f"hydra.searchpath=['{place}']", "seed=1", *more])
+        assert exit_.value.code == 2
+        assert message in capfd.readouterr().err
+    assert seen(tmp_path) == []
+
+
+@pytest.mark.parametrize("by", ["--config-dir", "hydra.searchpath"])
+def test_a_typing_error_beside_configs_of_ones_own_is_named(mine, capfd, by):
+    places = [by, mine] if by.startswith("--") else [f"hydra.searchpath=[{mine}]"]
+    for wrong, message in (("sede=1", "did you mean seed?"), ("+own=a", "Unknown key own")):
+        with pytest.raises(SystemExit):
+            command([*places, "+exp=mine", wrong])
+        assert message in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

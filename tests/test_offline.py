@@ -84,6 +84,12 @@ def test_a_finished_run_is_only_read_and_other_held_out_episodes_are_another_run
         run_experiment(settings(tmp_path, "task.held_out=2"), run)
 
 
+def test_other_recordings_are_another_run(run, tmp_path):
+    """Where scripted demonstrations lie does not matter, but which recordings are trained on does."""
+    with pytest.raises(UserError, match=r"another config: demos\.path was 'none', is 'other'"):
+        run_experiment(settings(tmp_path, "demos.path=other"), run)
+
+
 def test_data_of_another_robot_does_not_go_on_with_a_run(run, tmp_path, monkeypatch):
     faster = MemorySource(replace(ROBOT, control_hz=20.0))
     monkeypatch.setattr("imfvla.sources.mcap.open_source", lambda options, *, where: faster)

@@ -20,7 +20,7 @@ from imfvla.reporting.mapping import PATH, read_mapping
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
-STEMS = ("table1", "table2", "table3", "others")
+STEMS = ("table1", "table2", "table3", "aloha", "others")
 EXPECTED = Path(__file__).resolve().parent / "expected_tables"
 ANSWERED = ("socket_infer1", "socket_infer2", "socket_ddpm_ph32", "transfer_infer1", "transfer_native_dp")
 
@@ -70,11 +70,7 @@ def files(directory: Path) -> dict[str, bytes]:
 def test_all_files_are_there(runs, tmp_path, method):
     publish([runs], tmp_path / "out", MAPPING, method).write()
     found = files(tmp_path / "out")
-    tables = {
-        f"{stem}{suffix}"
-        for stem in ("table1", "table2", "table3", "others")
-        for suffix in (".md", ".csv", ".tex")
-    }
+    tables = {f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")}
     assert tables | {"index.html"} == {name for name in found if "/" not in name}
     figures = {name for name in found if name.startswith("figures/")}
     assert len(figures) == 18

@@ -9,10 +9,11 @@ import pytest
 import tiny_sweep
 
 from imfvla.completion import is_complete
-from imfvla.composition import CONFIG_DIRECTORY, run_name
+from imfvla.composition import CONFIG_DIRECTORY
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import untimed
 from imfvla.run_directory import DONE, LAST, RunDirectory
+from imfvla.run_names import run_name
 from imfvla.sweep import Planned, _Sweep, jobs_of_rows, waves
 
 MAPPING = read_mapping()

@@ -26,6 +26,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import pairwise
@@ -58,6 +59,7 @@ from imfvla.training.logger import read_metrics
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))  # the files to damage are those of the tests
+import outside  # noqa: E402
 from synthetic import write_demonstrations, write_episode  # noqa: E402
 from synthetic_runs import make_run, write_evaluation  # noqa: E402
 
@@ -330,7 +332,56 @@ def make_targets(folder: Path) -> dict[str, Target]:
         "options": (options, check_options, mutate_one_value),
         "tables": (tables, read_mapping.__wrapped__, mutate_yaml),
     }
-    return {name: Target(*reader) for name, reader in readers.items()}
+    return {name: Target(*reader) for name, reader in (readers | outside_readers(folder / "outside")).items()}
+
+
+def outside_readers(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Any], Callable[..., bytes]]]:
+    """The readers of data from outside whose extras are installed."""
+    readers = {}
+    with suppress(UserError):  # without pyarrow
+        from imfvla.sources import lerobot
+
+        whole = folder / "lerobot"
+        with lerobot.LeRobotWriter(whole, outside.ROBOT, pictures="h264") as writer:
+            writer.add(outside.episode(0))
+        (whole / "meta" / "imfvla_robot.json").unlink()  # so that the statistics are read
+
+        def open_lerobot(path: Path) -> None:
+            source = lerobot.open_source(outside.options("lerobot", path=str(whole)))
+            source.episode(0, ("front",))
+
+        files = {"info": "meta/info.json", "stats": "meta/stats.json", "tasks": "meta/tasks.parquet"}
+        files |= {
+            "data": "data/chunk-000/file-000.parquet",
+            "rows": "meta/episodes/chunk-000/file-000.parquet",
+        }
+        files["video"] = "videos/observation.images.front/chunk-000/file-000.mp4"
+        for name, file in files.items():
+            mutate = mutate_json if file.endswith(".json") else mutate_bytes
+            readers[f"lerobot_{name}"] = (whole / file, open_lerobot, mutate)
+    with suppress(UserError):  # without mcap-ros2-support
+        from bags import write_bag
+
+        from imfvla.sources import ros2
+
+        joints = [{"topic": "/joint_states", "channels": {"elbow": "elbow [rad]"}}]
+        given = {"control_hz": 20, "state": joints, "cameras": {"front": "/camera"}, "instruction": "go"}
+
+        def open_bag(path: Path) -> None:
+            ros2.open_source(outside.options("ros2", path=str(path)) | given).episode(0, ("front",))
+
+        readers["ros2"] = (write_bag(folder / "bag.mcap", end_s=0.5), open_bag, mutate_bytes)
+    with suppress(UserError):  # without h5py
+        from imfvla.sources import hdf5
+
+        lift = {"layout": "robomimic", "control_hz": 20, "instruction": "lift"}
+        lift |= {"state": outside.EEF_STATE, "action": outside.EEF_ACTION}
+
+        def open_hdf5(path: Path) -> None:
+            hdf5.open_source(outside.options("hdf5", path=str(path)) | lift).episode(0, ("agentview_image",))
+
+        readers["hdf5"] = (outside.write_robomimic(folder / "demo.hdf5", (0,)), open_hdf5, mutate_bytes)
+    return readers
 
 
 def fuzz(target: Target, num_files: int, first_seed: int) -> Tally:

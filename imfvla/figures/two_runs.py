@@ -11,7 +11,7 @@ from imfvla.figures.panels import say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import BLUE, GREY, INK, ORANGE, PALE, SKY, WIDTH, new_figure, style
 from imfvla.reporting.power import ALPHA
-from imfvla.reporting.two_runs import Compared, Duel
+from imfvla.reporting.two_runs import ComparedMeasure, Duel
 
 OUTCOMES = (("both", BLUE), ("A alone", SKY), ("B alone", ORANGE), ("neither", PALE))
 AXES = {
@@ -65,7 +65,7 @@ def _outcomes(axes: Axes, duels: Sequence[Duel]) -> None:
     axes.set_xlim(0, max(left))
 
 
-def _differences(axes: Axes, compared: Sequence[Compared]) -> None:
+def _differences(axes: Axes, compared: Sequence[ComparedMeasure]) -> None:
     measure = compared[0].measure
     axes.set_xlabel(AXES[measure.title])
     axes.axvline(measure.neutral, color=GREY, linewidth=1)

@@ -8,15 +8,15 @@ from typing import Any
 from imfvla.collection import (
     LATER_SETTINGS,
     LOG_NAME,
-    Settings,
-    folder_name,
     read_settings,
     record_demonstration,
     recorded_seeds,
     recording_path,
     sizes_of,
 )
+from imfvla.demonstrations import BimanualSettings
 from imfvla.documents import read_json
+from imfvla.environments import BIMANUAL, KIND, kind_of
 from imfvla.errors import UserError
 from imfvla.files import locked
 from imfvla.progress import Progress
@@ -29,9 +29,14 @@ SHARED = ("task", "variant", "modes", "dwell", "image_size")
 REMEDY = "leave --demos out to have the expert play"
 
 
-def settings_of(config: Mapping[str, Any]) -> Settings:
+def settings_of(config: Mapping[str, Any]) -> BimanualSettings:
     """How the demonstrations of a run were recorded, also of one that is older than some of the settings."""
     task, demos = config["task"], config["demos"]
+    if kind_of(task) != BIMANUAL:
+        raise UserError(
+            f"The run must be of one of this package's own tasks, found {KIND}={kind_of(task)}: the hidden choice of "
+            "other experts is not known."
+        )
     task = {**task, "expert": LATER_SETTINGS | task["expert"]}
     _, settings = read_settings(task, config["observation"], {"frames_directory": None} | demos, "demos")
     return settings
@@ -55,7 +60,7 @@ def record_starts(config: Mapping[str, Any], directory: Path, first_seed: int, e
             f"{first_seed}."
         )
     _refuse_trained(first_seed, trained_seeds(config, set()))
-    folder = directory / folder_name(settings)
+    folder = directory / settings.folder
     found: list[Path] = []
     with locked(folder), Progress("recorded starts", episodes) as bar:
         for seed in range(first_seed, first_seed + episodes + MOST_FAILURES):
@@ -96,7 +101,7 @@ def choose_recordings(
     return [recording_path(directory, seed) for seed in usable[:episodes]]
 
 
-def read_demonstration(path: Path, settings: Settings) -> Episode:
+def read_demonstration(path: Path, settings: BimanualSettings) -> Episode:
     """A recording with the run's views. Raises UserError where it is of another task, expert or picture size."""
     episode = read_episode(path, images=settings.views)
     if episode.info.kind != "demonstration":

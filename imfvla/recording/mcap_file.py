@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import IO
 
 import lz4.frame
 import zstandard
@@ -33,14 +34,19 @@ def records(data: bytes) -> Iterator[McapRecord]:
 
     Raises ValueError where chunks state more bytes than an episode can have: a small file can unpack to any size.
     """
-    reader = StreamReader(BytesIO(data), emit_chunks=True, validate_crcs=True, record_size_limit=len(data))
+    return streamed_records(BytesIO(data), len(data), MAX_EPISODE_BYTES)
+
+
+def streamed_records(stream: IO[bytes], size: int, most: int) -> Iterator[McapRecord]:
+    """`records` of an open file of `size` bytes whose chunks may unpack to `most` bytes in all."""
+    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
     total = 0
     for record in reader.records:
         if not isinstance(record, Chunk):
             yield record
             continue
         total += record.uncompressed_size
-        if record.uncompressed_size > MAX_CHUNK_BYTES or total > MAX_EPISODE_BYTES:
+        if record.uncompressed_size > MAX_CHUNK_BYTES or total > most:
             raise ValueError(f"chunks that unpack to {total} bytes")
         yield from breakup_chunk(replace(record, compression="", data=_unpacked(record)), validate_crc=True)
 

@@ -13,6 +13,7 @@ from imfvla.reporting.mapping import Mapping, TableRow, Wanted
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
 from imfvla.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
+from imfvla.run_names import run_name
 
 PROTOCOL = ("task", "variant", "noise_seed", "first_seed", "episodes", "max_steps", "device")
 
@@ -79,7 +80,7 @@ class Sources:
 
     def command(self, row: TableRow, mapping: Mapping) -> str:
         """What to run so that the row is filled."""
-        directory = f"runs/{row.experiment}/{','.join(sorted(row.overrides)) or 'default'}"
+        directory = f"runs/{row.experiment}/{run_name(row.overrides)}"
         for path, config in reversed(self.configs.items()):
             if _has_weights(path, config, row):
                 return _evaluate(row, path)

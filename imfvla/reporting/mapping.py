@@ -8,13 +8,15 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
+from imfvla.assets import folder
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of, require, suggestion
 from imfvla.reporting.mapping_file import entries, load, named, place_of, plain
 from imfvla.reporting.paper import PaperComparison, PaperRow, paper_comparisons, paper_numbers, paper_rows
 from imfvla.run_directory import LAST, step_of
+from imfvla.run_names import run_key, run_name
 
-PATH = Path(__file__).resolve().parents[2] / "experiments" / "tables.yaml"
+PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
 ROWS, COMPARISONS = "rows", "comparisons"
@@ -76,7 +78,7 @@ class TableRow:
     @property
     def run(self) -> str:
         """Name of the run directory below that of the experiment, its seed apart; "" for "default"."""
-        return run_key(",".join(sorted(self.overrides)))
+        return run_key(run_name(self.overrides))
 
     @property
     def label(self) -> str:
@@ -100,7 +102,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """All tables, their rows and the comparisons, each in its order; `tasks` are those that figures always show."""
+    """All tables, their rows and the comparisons, each in its order; `tasks` have titles."""
 
     tasks: tuple[TaskTitle, ...]
     tables: tuple[TableTitle, ...]
@@ -146,12 +148,6 @@ class _ComparisonEntry:
     baseline: str
     of: str
     operation: str
-
-
-def run_key(directory: str) -> str:
-    """What the name of a run directory says besides the training seed: "" for "default", "seed=1" and the like."""
-    parts = [part for part in directory.split(",") if not re.fullmatch(r"seed=\d+|default", part)]
-    return re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", ",".join(parts))
 
 
 @cache

@@ -4,9 +4,10 @@ import csv
 import re
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
-DIRECTORY = Path(__file__).resolve().parents[2] / "experiments" / "paper"
+from imfvla.assets import folder
+
+DIRECTORY = folder("experiments") / "paper"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import PaperRow
+from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, REFUSED, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
@@ -64,9 +65,27 @@ class Document:
     data: Table
 
 
-def row_table(title: str, results: Sequence[Result], notes: Sequence[str] = ()) -> Document:
-    """A table of rows: ours under each row that the paper prints, and those that the paper does not have."""
-    cells, keys = [], []
+def row_table(
+    title: str,
+    results: Sequence[Result],
+    notes: Sequence[str] = (),
+    published: Sequence[PublishedRow] = (),
+) -> Document:
+    """A table of rows: ours under each row that the paper prints, and those that the paper does not have.
+
+    Rates that other papers print head it, with their sources as notes.
+    """
+    cells = [
+        (
+            row.label,
+            NOTHING,
+            "published",
+            *(f"{row.success_percent:g}%" if c == "Success-like" else NOTHING for c in COLUMNS[3:]),
+        )
+        for row in published
+    ]
+    keys: list[tuple[str, ...]] = [()] * len(cells)
+    notes = (*notes, *dict.fromkeys(f"Published: {row.method}, {row.source}." for row in published))
     for result in results:
         if result.paper:
             cells.append((result.row.label, str(result.nfe), "paper", *printed(result.paper)))

@@ -46,7 +46,7 @@ MEASURES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class ComparedMeasure:
     """A measure of both; `contrast` is None where `refused` says why it cannot be computed."""
 
     measure: Measure
@@ -66,7 +66,7 @@ class Duel:
 
     ours: Evaluated
     theirs: Evaluated
-    compared: tuple[Compared, ...] = ()
+    compared: tuple[ComparedMeasure, ...] = ()
 
     @property
     def label(self) -> str:
@@ -121,7 +121,7 @@ def _compare(one: Evaluated, other: Evaluated) -> Duel:
     for measure in MEASURES:
         is_refused = measure.contrast is speedup and timed
         contrast = None if is_refused else measure.contrast(Pairs([one], [other]))
-        compared.append(Compared(measure, contrast, refused=timed if is_refused else None))
+        compared.append(ComparedMeasure(measure, contrast, refused=timed if is_refused else None))
     return Duel(one, other, tuple(compared))
 
 
@@ -148,7 +148,7 @@ def _listed(numbers: dict) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _difference(found: Compared) -> tuple[str, ...]:
+def _difference(found: ComparedMeasure) -> tuple[str, ...]:
     if found.contrast is None or found.contrast.result.value is None:
         return (REFUSED if found.refused else NOTHING, NOTHING, NOTHING, NOTHING, NOTHING)
     measure, contrast = found.measure, found.contrast
@@ -162,7 +162,7 @@ def _difference(found: Compared) -> tuple[str, ...]:
     )
 
 
-def _amount(found: Compared) -> str:
+def _amount(found: ComparedMeasure) -> str:
     measure, result = found.measure, found.contrast.result.scaled(found.measure.scale)
     if measure.neutral:
         return with_interval(result, measure.digits, measure.unit)
@@ -171,7 +171,7 @@ def _amount(found: Compared) -> str:
     return f"{result.value:{form}}{bounds}{measure.unit}"
 
 
-def _sentence(found: Compared) -> str:
+def _sentence(found: ComparedMeasure) -> str:
     measure = found.measure
     if found.refused:
         return f"{measure.title}: not compared, because {found.refused}."

@@ -20,15 +20,15 @@ from imfvla.sources.base import EpisodeArrays
 class McapOptions:
     """conf/demos/mcap.yaml, without what all sources share."""
 
-    directory: Annotated[str, Limit("a text that is not empty", bool)]
+    path: Annotated[str, Limit("a text that is not empty", bool)]
 
 
 def open_source(options: Mapping[str, Any], *, where: str = "demos") -> "McapSource":
-    """All recordings of `options["directory"]`, in the order of their names.
+    """All recordings of `options["path"]`, in the order of their names.
 
     Raises UserError where there are none, or where the first is damaged.
     """
-    return McapSource.of(build(McapOptions, options, where).directory)
+    return McapSource.of(build(McapOptions, options, where).path)
 
 
 class McapSource:

@@ -18,7 +18,7 @@ from imfvla.training.checkpoint import save_weights
 
 RUN = [
     "+exp=socket_ph32_exec16", "observation.image_size=[32,32]", "demos.episodes=2", "horizon.pred=8",
-    "horizon.exec=4", "size.width=20", "core.depth=1",
+    "horizon.exec=4", "size.width=20", "core.depth=1", "training.steps=5",
 ]  # fmt: skip
 
 

@@ -42,25 +42,25 @@ def test_recordings_of_different_robots_are_not_mixed(synthetic_demonstrations):
 
 
 def test_a_config_opens_what_its_source_says(synthetic_demonstrations):
-    config = compose("train", ["task=none", "demos=mcap", f"demos.directory={synthetic_demonstrations}"])
+    config = compose("train", ["task=none", "demos=mcap", f"demos.path={synthetic_demonstrations}"])
     assert isinstance(opening.open_source(config), McapSource)
     assert opening.source_kind(config) == "mcap"
     assert opening.source_kind({"demos": {"episodes": 1}}) == "scripted"  # as configs from before the key
 
 
 def test_an_unknown_source_or_option_is_named(synthetic_demonstrations):
-    config = compose("train", ["demos=mcap", f"demos.directory={synthetic_demonstrations}"])
+    config = compose("train", ["demos=mcap", f"demos.path={synthetic_demonstrations}"])
     with pytest.raises(
         UserError, match=r"demos\.source must be one of scripted, mcap, lerobot, .*found 'tape'"
     ):
         opening.open_source(config | {"demos": config["demos"] | {"source": "tape"}})
     with pytest.raises(UserError, match=r"Unknown key demos\.folder"):
-        mcap.open_source({"directory": "x", "folder": "y"})
+        mcap.open_source({"path": "x", "folder": "y"})
 
 
 def test_a_folder_without_recordings_is_named(tmp_path):
     with pytest.raises(UserError, match=r"No recordings .*nowhere"):
-        mcap.open_source({"directory": str(tmp_path / "nowhere")})
+        mcap.open_source({"path": str(tmp_path / "nowhere")})
 
 
 def test_paraphrases_that_are_no_texts_are_refused(tmp_path, monkeypatch):
