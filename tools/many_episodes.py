@@ -94,9 +94,8 @@ def write_store(episodes: int, folder: Path) -> None:
         action[own] = walk[:, robot.origin] + 0.02 * rng.normal(size=(STEPS, len(robot.action)))
     entry = {"task": "socket", "instructions": SENTENCES, "num_steps": STEPS, "num_frames": STEPS}
     entries = [{"name": f"episode {index}", **entry} for index in range(episodes)]
-    (path / "meta.json").write_text(
-        json.dumps({**meta_of(source, views, SIZE), "episodes": entries}, indent=1)
-    )
+    meta = {**meta_of(source, views, SIZE), "episodes": entries}
+    (path / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
 
 
 def start(episodes: int, folder: Path, began: float) -> dict[str, Any]:
