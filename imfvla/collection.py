@@ -17,16 +17,19 @@ from imfvla.files import clear_write_errors, locked, write_json
 from imfvla.fingerprint import physical_cores
 from imfvla.options import Limit, at_least, build, one_of, part_of, within
 from imfvla.progress import Progress
-from imfvla.protocol import MAX_WORKERS
+from imfvla.protocol import DEMONSTRATION_SEEDS, MAX_WORKERS, demonstration_seeds
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.rollout import run_episode
 
-SEED_LIMIT = 10_000  # demonstrations may use the seeds below
 LOG_NAME = "collection.json"
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
 EPISODE_TIMEOUT_S = 900.0
 NOT_EMPTY = Limit("a text that is not empty", bool)
+OF_DEMONSTRATIONS = Limit(
+    " or ".join(f"between {band[0]} and {band[-1]}" for band in DEMONSTRATION_SEEDS),
+    lambda seed: any(seed in band for band in DEMONSTRATION_SEEDS),
+)
 # What folders were recorded with before a setting had a name.
 LATER_SETTINGS = {"dwell": 0}
 log = logging.getLogger(__name__)
@@ -36,8 +39,8 @@ log = logging.getLogger(__name__)
 class DemoOptions:
     """Which demonstrations are requested and where they are stored."""
 
-    episodes: Annotated[int, within(1, SEED_LIMIT)]
-    first_seed: Annotated[int, within(0, SEED_LIMIT - 1)]
+    episodes: Annotated[int, within(1, sum(map(len, DEMONSTRATION_SEEDS)))]
+    first_seed: Annotated[int, OF_DEMONSTRATIONS]
     directory: Annotated[str, NOT_EMPTY]
     frames_directory: Annotated[str, NOT_EMPTY] | None  # of the frame store, see imfvla.training.data
     camera_every: Annotated[int, at_least(1)]
@@ -92,7 +95,7 @@ def collect(
         listed = _Log(directory, settings)
         on_file = recorded_seeds(directory) - listed.failed
         _name_others(directory, on_file)
-        usable = {seed for seed in on_file if options.first_seed <= seed < SEED_LIMIT}
+        usable = {seed for seed in on_file if options.first_seed <= seed and OF_DEMONSTRATIONS.holds(seed)}
         chosen = {seed for seed in usable if _is_recorded(directory, seed, settings)}
         workers = physical_cores() if options.workers is None else options.workers
         num_new = _record_missing(directory, settings, options, workers, listed, chosen)
@@ -143,7 +146,7 @@ def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> lis
     """The lowest untried seeds: just enough of them if all succeed."""
     batch: list[int] = []
     num_good = 0
-    for seed in range(options.first_seed, SEED_LIMIT):
+    for seed in demonstration_seeds(options.first_seed):
         if num_good + len(batch) == options.episodes:
             return batch
         if seed in chosen:
@@ -153,8 +156,9 @@ def _next_batch(options: DemoOptions, chosen: set[int], failed: set[int]) -> lis
     if num_good + len(batch) == options.episodes:
         return batch
     raise UserError(
-        f"demos.episodes={options.episodes} cannot be collected: the seeds for demonstrations end at {SEED_LIMIT - 1}, "
-        f"and from {options.first_seed} on {len(failed)} failed; ask for fewer or lower demos.first_seed."
+        f"demos.episodes={options.episodes} cannot be collected: the seeds for demonstrations end at "
+        f"{DEMONSTRATION_SEEDS[-1][-1]}, and from {options.first_seed} on {len(failed)} failed; ask for fewer or lower "
+        "demos.first_seed."
     )
 
 
@@ -234,7 +238,9 @@ def recording_path(directory: Path, seed: int) -> Path:
 
 def recorded_seeds(directory: Path) -> set[int]:
     """The seeds of which a folder has files, whole or not."""
-    found = (re.fullmatch(r"episode-(\d{6})\.mcap", path.name) for path in directory.glob("*.mcap"))
+    found = (
+        re.fullmatch(r"episode-(\d{6}|[1-9]\d{6})\.mcap", path.name) for path in directory.glob("*.mcap")
+    )
     return {int(match.group(1)) for match in found if match}
 
 

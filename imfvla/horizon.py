@@ -44,14 +44,20 @@ class Horizon:
                 f"0, found exec={self.exec} and ensemble={self.ensemble}; set horizon.exec=1 or horizon.ensemble=null."
             )
 
-    def observed_steps(self, step: int) -> np.ndarray:
-        """Steps seen at the decision `step`, oldest first: int64 (obs,), clamped at the episode's start."""
-        return np.maximum(np.arange(step - self.obs + 1, step + 1), 0)
+    def observed_steps(self, step: int | np.ndarray) -> np.ndarray:
+        """Steps seen at a decision, or at several (...,): int64 (..., obs), oldest first, clamped at the start."""
+        return np.maximum(np.asarray(step)[..., None] + np.arange(1 - self.obs, 1), 0)
 
-    def action_steps(self, step: int, episode_length: int) -> tuple[np.ndarray, np.ndarray]:
-        """Steps of the chunk decided at `step`: int64 (pred,), the last repeated past the end; bool (pred,) valid."""
-        steps = np.arange(step, step + self.pred)
-        return np.minimum(steps, episode_length - 1), steps < episode_length
+    def action_steps(
+        self, step: int | np.ndarray, episode_length: int | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of the chunks decided at `step`, one or several (...,), each of an episode of that length.
+
+        int64 (..., pred), the last repeated past the episode's end, and bool (..., pred) whether it is before the end.
+        """
+        steps = np.asarray(step)[..., None] + np.arange(self.pred)
+        end = np.asarray(episode_length)[..., None]
+        return np.minimum(steps, end - 1), steps < end
 
     def is_decision(self, step: int) -> bool:
         """Whether the policy replans at `step` of an episode."""

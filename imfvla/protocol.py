@@ -1,17 +1,20 @@
 """The options of an evaluation, and what its rows depend on besides the code. Needs neither torch nor mujoco."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import chain
 from typing import Annotated, Any
 
 from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
 # Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
-# tables are for reporting alone.
+# tables are for reporting alone. More demonstrations than the first band has go on behind all of these.
 SELECTION_FIRST_SEED, REPORTING_FIRST_SEED = 10_000, 100_000
+DEMONSTRATION_SEEDS = range(SELECTION_FIRST_SEED), range(1_000_000, 10_000_000)
+REPORTING_SEEDS = range(REPORTING_FIRST_SEED, DEMONSTRATION_SEEDS[1].start)
 LAST = "last"  # of the weights that are kept
 MAX_SEED = 2**32 - 1  # the highest that numpy's generators and MuJoCo's start states accept
 MAX_EPISODES = 1_000_000
@@ -97,6 +100,12 @@ class Protocol:
         }
         suffixes = "".join(text for text, applies in unusual.items() if applies)
         return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{suffixes}"
+
+
+def demonstration_seeds(first_seed: int) -> Iterator[int]:
+    """The seeds of demonstrations from `first_seed` on, ascending over both bands."""
+    bands = (range(max(first_seed, band.start), band.stop) for band in DEMONSTRATION_SEEDS)
+    return chain.from_iterable(bands)
 
 
 def as_recorded(protocol: Mapping[str, Any]) -> dict[str, Any]:

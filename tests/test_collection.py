@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from imfvla import collection
-from imfvla.collection import collect
+from imfvla.collection import collect, recorded_seeds
 from imfvla.composition import compose
 from imfvla.errors import UserError
 from imfvla.recording import read_episode
@@ -28,12 +28,12 @@ def recorded(tmp_path_factory):
 
 @pytest.fixture
 def played(monkeypatch):
-    """Instead of playing: seeds 1 and 4 fail, others leave an empty file. Lists the seeds that were played."""
+    """Instead of playing: seeds 1, 4 and 1000001 fail, others leave an empty file. Lists the seeds that were played."""
     seeds = []
 
     def record(settings, directory, seed):
         seeds.append(seed)
-        if seed in (1, 4):
+        if seed in (1, 4, 1_000_001):
             return seed, False
         collection.recording_path(directory, seed).write_bytes(b"episode")
         return seed, True
@@ -177,12 +177,37 @@ def test_the_seeds_used_do_not_depend_on_interruptions(played, tmp_path):
 
 
 def test_the_seeds_of_the_band_can_run_out(played, tmp_path):
-    with pytest.raises(UserError, match=r"demos.episodes=3 cannot be collected: .* end at 9999"):
-        collect(TASK, OBSERVATION, demos(tmp_path, episodes=3, first_seed=9998))
+    with pytest.raises(UserError, match=r"demos.episodes=3 cannot be collected: .* end at 9999999"):
+        collect(TASK, OBSERVATION, demos(tmp_path, episodes=3, first_seed=9_999_998))
+
+
+def test_more_demonstrations_go_on_behind_the_seeds_of_evaluations(played, tmp_path):
+    first = collect(TASK, OBSERVATION, demos(tmp_path, episodes=1, first_seed=9999))
+    report = collect(TASK, OBSERVATION, demos(tmp_path, episodes=4, first_seed=9999))
+    assert played == [9999, 1_000_000, 1_000_001, 1_000_002, 1_000_003]
+    seeds = [9999, 1_000_000, 1_000_002, 1_000_003]  # from 1000001 the expert fails
+    assert [path.name for path in report.recordings.files] == [f"episode-{seed:06d}.mcap" for seed in seeds]
+    assert folder(report) == folder(first)
+    assert recorded_seeds(folder(report)) == set(seeds)
+    assert files(folder(report)) == [path.name for path in report.recordings.files]
+    again = collect(TASK, OBSERVATION, demos(tmp_path, episodes=2, first_seed=1_000_000))
+    assert (again.num_new, [path.name for path in again.recordings.files]) == (0, files(folder(report))[1:3])
+
+
+def test_a_name_that_no_demonstration_has_is_no_demonstration(tmp_path):
+    for name in (
+        "episode-0000007.mcap",
+        "episode-12345.mcap",
+        "episode-000008.mcap",
+        "episode-10000000.mcap",
+    ):
+        (tmp_path / name).touch()
+    assert recorded_seeds(tmp_path) == {8}
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("episodes", 0), ("first_seed", 10_000), ("camera_every", 0), ("workers", -1)]
+    ("key", "value"),
+    [("episodes", 0), ("first_seed", 10_000), ("first_seed", 999_999), ("camera_every", 0), ("workers", -1)],
 )
 def test_mistakes_are_named(key, value, tmp_path):
     with pytest.raises(UserError, match=f"^{key} must be "):

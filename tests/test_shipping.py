@@ -99,6 +99,7 @@ def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
     [
         ({"state": RUNNING}, "not a finished run"),
         ({"first_seed": 10_000}, "no evaluation of the reporting band"),
+        ({"first_seed": 1_000_000}, "no evaluation of the reporting band"),
         ({"size": 8_000_001}, "wanted at most 8000000"),
     ],
 )

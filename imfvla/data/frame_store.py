@@ -54,8 +54,9 @@ class FrameStore:
     image_size: tuple[int, int]  # (H, W) [px]
     episodes: tuple[StoredEpisode, ...]
     images: np.ndarray  # uint8 (N, V, 3, H, W), memory-mapped; channels first, as batches want them
-    state: np.ndarray  # float32 (T, S)
-    action: np.ndarray  # float32 (T, A)  clean
+    image_steps: np.ndarray  # int64 (N,)  step of each frame within its episode, memory-mapped
+    state: np.ndarray  # float32 (T, S), memory-mapped
+    action: np.ndarray  # float32 (T, A)  clean, memory-mapped
 
     @classmethod
     def open(cls, path: str | Path) -> "FrameStore":
@@ -70,9 +71,11 @@ class FrameStore:
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
             images = np.asarray(np.memmap(path / IMAGES, np.uint8, "r", shape=shape))
             episodes, row, frame = [], 0, 0
+            known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
                 steps = image_steps[frame : frame + entry.pop("num_frames")]
-                entry["instructions"] = tuple(entry["instructions"])
+                instructions = tuple(entry["instructions"])
+                entry["instructions"] = known.setdefault(instructions, instructions)
                 episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
@@ -83,7 +86,7 @@ class FrameStore:
                 "demos.frames_directory, and run again."
             ) from error
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
-        return cls(path, views, image_size, tuple(episodes), images, state, action)
+        return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action)
 
     @classmethod
     def build(
@@ -106,15 +109,15 @@ class FrameStore:
         store_path = Path(store_path)
         for view in views:
             source.robot.camera(view)
-        meta = _meta(source, tuple(views), tuple(image_size))
+        meta = meta_of(source, tuple(views), tuple(image_size))
         with locked(store_path):
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
 
 
-def _meta(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
-    """What a store is made from; its digest shows whether the store is up to date."""
+def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
+    """What a store is made from, as in its meta.json; the digest shows whether the store is up to date."""
     content = json.dumps([FORMAT, views, image_size, source.digest()])
     return {
         "format": FORMAT,
@@ -201,8 +204,8 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _load(path: Path) -> np.ndarray:
-    """Memory-mapped first, so that a header that states more than the file holds is refused, not allocated."""
-    return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    """Memory-mapped: all processes share it, and a header that states more than the file holds is refused."""
+    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
 def _decoded(

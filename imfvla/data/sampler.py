@@ -55,6 +55,6 @@ class ResumableSampler:
         self.next_batch = int(state["next_batch"])
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)  # a batch at the border of two epochs needs both
 def _permutation(seed: int, epoch: int, num_items: int) -> np.ndarray:
     return np.random.default_rng(np.random.SeedSequence([seed, epoch])).permutation(num_items)

@@ -1,6 +1,6 @@
 """Training items: what was observed at a decision and the actions that followed.
 
-Shapes: B batch, W windows, To observed steps, Tp predicted steps, V views, L instruction words.
+Shapes: B batch, W windows, To observed steps, Tp predicted steps, V views, S state, A action, L instruction words.
 """
 
 from collections.abc import Collection
@@ -13,7 +13,7 @@ from imfvla.errors import UserError
 from imfvla.horizon import Horizon
 from imfvla.instruction import tokenize
 from imfvla.robot import RobotSpec
-from imfvla.statistics import Statistics
+from imfvla.statistics import RunningStatistics, Statistics
 from imfvla.types import Batch, Observation
 
 
@@ -47,83 +47,96 @@ class Windows:
         self._index_instructions(paraphrases)
 
     def __len__(self) -> int:
-        return len(self.steps)
+        return len(self._frame)
+
+    def decisions(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The windows `indices` (B,): numbers of their episodes in the store, steps decided at within these (B,)."""
+        frame = self._frame[indices]
+        return self._episode_of(frame), self.store.image_steps[frame]
 
     def batch(self, indices: np.ndarray, rng: np.random.Generator) -> Batch:
         """The windows `indices` (B,), each with one of its episode's sentences drawn by `rng`."""
-        frames = self._frames[indices]
+        frame = self._frame[indices]
+        episodes, steps = self._episode_of(frame), self.store.image_steps[frame]
+        seen = self.horizon.observed_steps(steps)
+        # All of these steps have frames, so that as many frames lie between two of them as steps.
+        frames = (frame - steps)[:, None] + seen
         images = np.take(self.store.images, frames.reshape(-1), axis=0)
-        episodes = self.episodes[indices]
         sentences = self._first_sentence[episodes] + rng.integers(self._num_sentences[episodes])
         observation = Observation(
             images=torch.from_numpy(images.reshape(*frames.shape, *images.shape[1:])),
-            state=torch.from_numpy(self.store.state[self._observed[indices]]),
+            state=torch.from_numpy(self.store.state[self._first_row[episodes, None] + seen]),
             instruction=torch.from_numpy(self._word_ids[sentences]),
         )
-        actions = torch.from_numpy(self.store.action[self._followed[indices]])
-        return Batch(observation, actions, torch.from_numpy(self._valid[indices]))
+        actions, valid = self._followed(episodes, steps)
+        return Batch(observation, torch.from_numpy(actions), torch.from_numpy(valid))
 
     def decided(self, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Without pictures: states (B, S) at the decisions `indices`, actions (B, Tp, A) and valid (B, Tp)."""
-        state = self.store.state[self._observed[indices, -1]]
-        return state, self.store.action[self._followed[indices]], self._valid[indices]
+        episodes, steps = self.decisions(indices)
+        return self.store.state[self._first_row[episodes] + steps], *self._followed(episodes, steps)
 
     def describe(self, indices: np.ndarray) -> list[str]:
         """Episode and decision step of each window."""
-        names = [self.store.episodes[number].name for number in self.episodes[indices]]
-        return [f"{name}, step {step}" for name, step in zip(names, self.steps[indices], strict=True)]
+        return [
+            f"{self.store.episodes[number].name}, step {step}"
+            for number, step in zip(*self.decisions(indices), strict=True)
+        ]
 
     def statistics(self) -> Statistics:
         """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
-        store, rows = self.store, self._rows()
-        decided_at = store.state[self._observed[:, -1:]]
-        displacement = store.action[self._followed] - decided_at[..., self.robot.origin]
-        return Statistics.of(store.state[rows], store.action[rows], displacement, self._valid)
+        store, running = self.store, RunningStatistics(self.robot.origin, self.horizon.pred)
+        firsts = np.searchsorted(self._frame, self._first_frame[self.chosen])
+        ends = np.append(firsts[1:], len(self._frame))
+        for number, first, end in zip(self.chosen, firsts, ends, strict=True):
+            episode = store.episodes[number]
+            rows = slice(episode.first_row, episode.first_row + episode.num_steps)
+            running.add(store.state[rows], store.action[rows], store.image_steps[self._frame[first:end]])
+        return running.result()
 
-    def _rows(self) -> np.ndarray | slice:
-        """The rows of the store's states and actions that belong to the chosen episodes."""
-        if len(self.chosen) == len(self.store.episodes):
-            return slice(None)
-        chosen = [self.store.episodes[number] for number in self.chosen]
-        return np.concatenate([np.arange(one.num_steps) + one.first_row for one in chosen])
+    def _followed(self, episodes: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Actions (B, Tp, A) and valid (B, Tp) of the chunks decided at these steps of these episodes (B,)."""
+        after, valid = self.horizon.action_steps(steps, self._num_steps[episodes])
+        return self.store.action[self._first_row[episodes, None] + after], valid
+
+    def _episode_of(self, frame: np.ndarray) -> np.ndarray:
+        """Numbers of the episodes of these frames; one without frames begins where the next one does."""
+        return np.searchsorted(self._first_frame, frame, side="right") - 1
 
     def _index_windows(self) -> None:
-        episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []
-        for number in self.chosen:
-            episode = self.store.episodes[number]
-            frame_at = np.full(episode.num_steps, -1)
-            frame_at[episode.image_steps] = episode.first_frame + np.arange(len(episode.image_steps))
-            for step in episode.image_steps:
-                seen = self.horizon.observed_steps(step)
-                if (frame_at[seen] < 0).any():
-                    continue
-                after, after_valid = self.horizon.action_steps(step, episode.num_steps)
-                episodes.append(number)
-                steps.append(step)
-                frames.append(frame_at[seen])
-                observed.append(episode.first_row + seen)
-                followed.append(episode.first_row + after)
-                valid.append(after_valid)
-        if not steps or (self.horizon.obs > 1 and not any(steps)):
+        """Holds one number a window, the rest is computed by batch: there may be millions."""
+        episodes = self.store.episodes
+        self._first_frame = np.array([one.first_frame for one in episodes])  # (episodes,)
+        self._first_row = np.array([one.first_row for one in episodes])  # (episodes,)
+        self._num_steps = np.array([one.num_steps for one in episodes])  # (episodes,)
+        found = [self._decidable(number) for number in self.chosen]
+        self._frame = np.concatenate([np.empty(0, np.int64), *found])  # (W,)  rows of store.images
+        if not len(self._frame) or (self.horizon.obs > 1 and not self.store.image_steps[self._frame].any()):
             raise UserError(
                 f"horizon.obs={self.horizon.obs} needs frames at that many consecutive control steps, and "
                 f"the episodes in {self.store.path} have none: collect with camera_every=1, or set "
                 "horizon.obs=1."
             )
-        self.episodes = np.array(episodes)  # (W,)  number of the episode in the store
-        self.steps = np.array(steps)  # (W,)  decision step within the episode
-        self._frames = np.array(frames)  # (W, To)  rows of store.images
-        self._observed = np.array(observed)  # (W, To)  rows of store.state
-        self._followed = np.array(followed)  # (W, Tp)  rows of store.action
-        self._valid = np.array(valid)  # (W, Tp)
+
+    def _decidable(self, number: int) -> np.ndarray:
+        """Rows of the store's images at which a policy can decide in an episode: int64, ascending."""
+        episode = self.store.episodes[number]
+        own = np.arange(len(episode.image_steps))
+        seen = self.horizon.observed_steps(episode.image_steps)
+        places = own[:, None] + seen - episode.image_steps[:, None]  # of their frames, if none is missing
+        has_all = (places >= 0) & (episode.image_steps[np.maximum(places, 0)] == seen)
+        return episode.first_frame + own[has_all.all(axis=1)]
 
     def _index_instructions(self, paraphrases: bool) -> None:
         sentences: list[str] = []
+        places: dict[tuple[str, ...], int] = {}  # thousands of episodes share their sentences
         first, count = [], []
         for episode in self.store.episodes:
-            known = dict.fromkeys(episode.instructions if paraphrases else episode.instructions[:1])
-            first.append(len(sentences))
+            known = tuple(dict.fromkeys(episode.instructions if paraphrases else episode.instructions[:1]))
+            if known not in places:
+                places[known] = len(sentences)
+                sentences.extend(known)
+            first.append(places[known])
             count.append(len(known))
-            sentences.extend(known)
         self._word_ids = np.stack([tokenize(sentence) for sentence in sentences])  # (sentences, L)
         self._first_sentence, self._num_sentences = np.array(first), np.array(count)  # (episodes,)

@@ -33,6 +33,12 @@ LEARNS = {
             r"with the conditional velocity $v = e - x$",
         ),
     ),
+    "StagedMeanFlow": (
+        "Mean Flow in two stages: what is learnt",
+        r"first  $v_\theta(z_t, t)\;\longrightarrow\; e - x$,   then  "
+        r"$u_\theta(z_t, r, t)\;\longrightarrow\;\mathrm{sg}\left[\overline{v_\theta}\right]$",
+        (),
+    ),
     "FlowMatching": (
         "Flow matching: what is learnt",
         r"$v_\theta(z_t, t)\;\longrightarrow\; e - x$",
@@ -93,14 +99,17 @@ def _average(sheet: Sheet, method: Method) -> None:
     equation = r"$u(z_t, r, t) = \frac{1}{t-r}\int_r^t v(z_\tau, \tau)\,d\tau = v - (t-r)\,\frac{d}{dt}u$"
     sheet.text(95.5, 62.6, equation, 56, size=10)
     place = _curve(sheet, 71, 46, 49, 14)
-    counts = [nfe for nfe in method.nfe if nfe <= len(STEP_COLORS)]
+    counts = [nfe for nfe in method.nfe if nfe <= len(STEP_COLORS) and nfe not in method.instant_nfe]
     for color, nfe in zip(STEP_COLORS, counts, strict=False):
         times = np.linspace(1, 0, nfe + 1)
         for begin, finish in pairwise(times):
             sheet.arrow(place(begin), place(finish), color=color, width=1.6, head=11)
     for index, (color, nfe) in enumerate(zip(STEP_COLORS, counts, strict=False)):
         sheet.text(104, 58.6 - 2.7 * index, f"infer{nfe}", size=8, color=color, weight="bold", ha="left")
-    if not counts:
+    if method.instant_nfe:
+        names = ", ".join(f"infer{nfe}" for nfe in method.instant_nfe)
+        sheet.text(104, 58.6 - 2.7 * len(counts), f"{names}: steps of $v$", 21, size=7, ha="left")
+    elif not counts:
         sheet.text(104, 58.6, f"infer{method.nfe[0]}: no average is used", size=7, ha="left")
 
 
@@ -133,6 +142,8 @@ def _training(sheet: Sheet, method: Method) -> None:
     if equation:
         sheet.text(32.5, 28.5, equation, 58, size=10)
     lines = list(remarks)
+    if method.is_staged:
+        lines += _stages(method)
     if method.num_levels:
         lines.append(f"at one of {method.num_levels} levels of noise")
     if method.parametrisation == "data":
@@ -141,7 +152,8 @@ def _training(sheet: Sheet, method: Method) -> None:
         lines.append(r"the network gives the velocity itself")
     details = [] if method.times is None else [method.times]
     if method.boundary_share:
-        details.append(f"{method.boundary_share:.0%} of the draws span all of [0, 1]")
+        draws = "intervals" if method.is_staged else "draws"
+        details.append(f"{method.boundary_share:.0%} of the {draws} span all of [0, 1]")
     if details:
         lines.append(", ".join(details))
     top, each = 23.2, 3.6
@@ -150,6 +162,15 @@ def _training(sheet: Sheet, method: Method) -> None:
     calls = "call" if method.nfe == (1,) else "calls"
     text = f"an action chunk for the robot from {listing(method.nfe)} {calls} of the network"
     sheet.box(6, 3.6, 53, 5, [text], face="white", edge=PURPLE, size=8, rounding=0.8)
+
+
+def _stages(method: Method) -> list[str]:
+    """What the second stage of two learns from, and when."""
+    steps = "one Euler step" if method.path_steps == 1 else f"{method.path_steps} Euler steps"
+    return [
+        rf"$\overline{{v_\theta}}$: mean of $v_\theta$ over {steps} along its own path, from $z_t$ to $r$",
+        rf"$u_\theta$ has action blocks of its own, learnt after {method.average_from:.0%} of the training",
+    ]
 
 
 def _residuals(sheet: Sheet, method: Method) -> None:

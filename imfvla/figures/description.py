@@ -20,6 +20,7 @@ TWO_SUBLAYERS = ("attention", "MLP")
 GENERATOR = {
     "ImprovedMeanFlow": "improved Mean Flow",
     "MeanFlow": "Mean Flow",
+    "StagedMeanFlow": "Mean Flow in two stages",
     "FlowMatching": "flow matching",
     "DenoisingDiffusion": "diffusion (DDPM)",
     "Regression": "L1 regression",
@@ -67,6 +68,8 @@ class Method:
     parametrisation: str | None
     times: str | None
     boundary_share: float | None
+    average_from: float | None  # of two stages: the share of the training before the second one
+    path_steps: int | None  # of the second stage
     prediction: str | None  # of diffusion
     num_levels: int | None
     nfe: tuple[int, ...]
@@ -84,6 +87,18 @@ class Method:
     @property
     def is_improved_mean_flow(self) -> bool:
         return self.generator_class == "ImprovedMeanFlow"
+
+    @property
+    def is_staged(self) -> bool:
+        """Whether the average velocity is learned after the instantaneous one."""
+        return self.generator_class == "StagedMeanFlow"
+
+    @property
+    def instant_nfe(self) -> tuple[int, ...]:
+        """Those of `nfe` whose steps follow the instantaneous velocity although an average is learned."""
+        if not self.is_staged or self.boundary_share is None or self.boundary_share < 1:
+            return ()
+        return tuple(nfe for nfe in self.nfe if nfe > 1)
 
 
 def describe(config: Mapping[str, Any]) -> Method:
@@ -120,6 +135,8 @@ def describe(config: Mapping[str, Any]) -> Method:
         parametrisation=generator.get("parametrisation"),
         times=_name(times, TIMES) if times else None,
         boundary_share=generator.get("boundary_share"),
+        average_from=generator.get("average_from"),
+        path_steps=generator.get("path_steps"),
         prediction=generator.get("prediction"),
         num_levels=generator.get("num_levels"),
         nfe=tuple(config["evaluation"]["nfe"]),

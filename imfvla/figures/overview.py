@@ -110,6 +110,9 @@ def _generator(sheet: Sheet, method: Method) -> None:
     sheet.text(107.75, 64.3, method.generator, 34, size=8, weight="bold")
     if method.is_improved_mean_flow or method.generator_class == "MeanFlow":
         sheet.text(107.75, 60.4, r"average velocity  $u_\theta(z_t, r, t)$", 34, size=8)
+    elif method.is_staged:
+        text = r"velocity  $v_\theta(z_t, t)$,  then its average  $u_\theta(z_t, r, t)$"
+        sheet.text(107.75, 60.4, text, 34, size=8)
     elif method.generator_class == "FlowMatching":
         sheet.text(107.75, 60.4, r"velocity  $v_\theta(z_t, t)$", 34, size=8)
     left, right = 99.0, 121.5
@@ -122,9 +125,16 @@ def _generator(sheet: Sheet, method: Method) -> None:
         y = top - index * each - 1.0
         sheet.text(94.2, y, f"infer{nfe}", 8, size=7.5, weight="bold")
         _steps(sheet, left, right, y, nfe)
-    plural = "call" if rows == (1,) else "calls"
-    text = f"{listing(rows)} {plural} of the network;\nthe context is encoded once"
-    sheet.text(107.75, 24.6, text, 34, size=7)
+    sheet.text(107.75, 24.6, f"{_calls(method, rows)};\nthe context is encoded once", 34, size=7)
+
+
+def _calls(method: Method, rows: tuple[int, ...]) -> str:
+    """How often the network is called, and for which velocity where it has two."""
+    if not method.instant_nfe:
+        return f"{listing(rows)} {'call' if rows == (1,) else 'calls'} of the network"
+    if 1 in rows:
+        return r"one call of $u_\theta$, or more of $v_\theta$"
+    return rf"{listing(rows)} calls of $v_\theta$"
 
 
 def _steps(sheet: Sheet, left: float, right: float, y: float, nfe: int) -> None:

@@ -1,7 +1,7 @@
 """Which recordings samples are judged on: demonstrations of the run's own task that it was not trained on."""
 
 from collections.abc import Mapping
-from itertools import count, islice
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from imfvla.environments import BIMANUAL, KIND, kind_of
 from imfvla.errors import UserError
 from imfvla.files import locked
 from imfvla.progress import Progress
-from imfvla.protocol import REPORTING_FIRST_SEED
+from imfvla.protocol import REPORTING_FIRST_SEED, demonstration_seeds
 from imfvla.recording import Episode, read_episode
 
 MOST_FAILURES = 20  # of the expert, before it is given up
@@ -44,7 +44,7 @@ def settings_of(config: Mapping[str, Any]) -> BimanualSettings:
 
 def trained_seeds(config: Mapping[str, Any], failed: set[int]) -> set[int]:
     """The seeds of the demonstrations of a run; `failed` are those at which the expert did not succeed."""
-    seeds = (seed for seed in count(config["demos"]["first_seed"]) if seed not in failed)
+    seeds = (seed for seed in demonstration_seeds(config["demos"]["first_seed"]) if seed not in failed)
     return set(islice(seeds, config["demos"]["episodes"]))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.protocol import REPORTING_FIRST_SEED, USUAL_NOISE, as_recorded
+from imfvla.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.reporting.mapping import TableRow, read_mapping
 from imfvla.run_directory import RunDirectory, training_steps
 from imfvla.run_names import run_key
@@ -87,7 +87,7 @@ class Evaluation:
     def is_reporting(self) -> bool:
         """Whether whole episodes were rolled out from seeds of the reporting band."""
         whole = self.summary["protocol"].get("max_steps") is None
-        return whole and self.summary["seeds"][0] >= REPORTING_FIRST_SEED
+        return whole and all(seed in REPORTING_SEEDS for seed in self.summary["seeds"])
 
 
 def key_of(run: Path, experiment: str) -> str:

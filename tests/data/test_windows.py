@@ -40,19 +40,24 @@ def whole(windows: Windows):
     return windows.batch(np.arange(len(windows)), np.random.default_rng(0))
 
 
+def where(windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+    """Episode and step of every window."""
+    return windows.decisions(np.arange(len(windows)))
+
+
 HORIZONS = [(1, 1, 1), (1, 8, 4), (1, 16, 16), (2, 8, 4), (2, 8, 8), (3, 16, 5), (4, 32, 32)]
 
 
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
     windows = Windows(dense, Horizon(*horizon), ROBOT)
-    batch = whole(windows)
+    batch, (episodes, steps) = whole(windows), where(windows)
     assert len(windows) == NUM_EPISODES * NUM_STEPS
     for seed in range(NUM_EPISODES):
         executed = []
         for step in range(NUM_STEPS):
             if windows.horizon.is_decision(step):
-                (row,) = np.flatnonzero((windows.episodes == seed) & (windows.steps == step))
+                (row,) = np.flatnonzero((episodes == seed) & (steps == step))
                 chunk = batch.actions[row][batch.valid[row]]
                 executed.extend(chunk[: windows.horizon.exec])
         np.testing.assert_array_equal(np.stack(executed), synthetic_actions(seed, NUM_STEPS))
@@ -61,11 +66,11 @@ def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_a_window_sees_what_a_rollout_would_see(dense, horizon):
     windows = Windows(dense, Horizon(*horizon), ROBOT)
-    batch = whole(windows)
+    batch, (episodes, steps) = whole(windows), where(windows)
     scene = StillScene(bimanual_robot(VIEWS, (8, 8)))
     for row in range(0, len(windows), 5):
-        recorded = synthetic_actions(int(windows.episodes[row]), NUM_STEPS)
-        for past, step in enumerate(windows.horizon.observed_steps(windows.steps[row])):
+        recorded = synthetic_actions(int(episodes[row]), NUM_STEPS)
+        for past, step in enumerate(windows.horizon.observed_steps(steps[row])):
             state = recorded[max(step - 1, 0)]
             np.testing.assert_array_equal(batch.obs.state[row, past], state)
             scene.position = state[0]
@@ -77,8 +82,8 @@ def test_a_window_sees_what_a_rollout_would_see(dense, horizon):
 @pytest.mark.parametrize("horizon", HORIZONS)
 def test_valid_ends_with_the_episode(dense, horizon):
     windows = Windows(dense, Horizon(*horizon), ROBOT)
-    batch = whole(windows)
-    left = torch.from_numpy(NUM_STEPS - windows.steps).clamp(max=windows.horizon.pred)
+    batch, (_, steps) = whole(windows), where(windows)
+    left = torch.from_numpy(NUM_STEPS - steps).clamp(max=windows.horizon.pred)
     np.testing.assert_array_equal(batch.valid.sum(dim=1), left)
     assert batch.valid[:, 0].all()
     assert (batch.valid[:, 1:] <= batch.valid[:, :-1]).all()
@@ -86,9 +91,9 @@ def test_valid_ends_with_the_episode(dense, horizon):
 
 def test_valid_actions_are_of_their_own_episode(dense):
     windows = Windows(dense, Horizon(1, 32, 16), ROBOT)
-    batch = whole(windows)
+    batch, (episodes, steps) = whole(windows), where(windows)
     for row in range(len(windows)):
-        recorded = synthetic_actions(int(windows.episodes[row]), NUM_STEPS)[windows.steps[row] :]
+        recorded = synthetic_actions(int(episodes[row]), NUM_STEPS)[steps[row] :]
         np.testing.assert_array_equal(batch.actions[row][batch.valid[row]], recorded[:32])
         padding = batch.actions[row][~batch.valid[row]]
         np.testing.assert_array_equal(padding, np.broadcast_to(recorded[-1], padding.shape))
@@ -96,7 +101,7 @@ def test_valid_actions_are_of_their_own_episode(dense):
 
 def test_sparse_frames_decide_where_they_are(sparse):
     windows = Windows(sparse, Horizon(1, 4, 2), ROBOT)
-    assert windows.steps.tolist() == list(range(0, NUM_STEPS, 2)) * NUM_EPISODES
+    assert where(windows)[1].tolist() == list(range(0, NUM_STEPS, 2)) * NUM_EPISODES
 
 
 def test_sparse_frames_cannot_serve_two_consecutive_observations(sparse):

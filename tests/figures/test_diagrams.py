@@ -4,11 +4,12 @@ from copy import deepcopy
 from typing import Any
 
 import pytest
+import yaml
 from seen import clipped, texts
 
-from imfvla.composition import compose
-from imfvla.figures.components import method_components
-from imfvla.figures.description import describe
+from imfvla.composition import CONFIG_DIRECTORY, compose
+from imfvla.figures.components import LEARNS, method_components
+from imfvla.figures.description import GENERATOR, describe
 from imfvla.figures.diagram import Sheet
 from imfvla.figures.overview import method_overview
 from imfvla.figures.style import render
@@ -91,6 +92,18 @@ def test_the_components_are_those_configured(config, key, value):
             "two-step regression",
             "Two-step regression: what is learnt",
         ),
+        (["generator=imf"], "Mean Flow in two stages", "Mean Flow in two stages: what is learnt"),
+        (
+            ["generator=imf", "generator.boundary_share=0.5", "generator.path_steps=1"],
+            "1, 2 or 3 calls of the network",
+            "over one Euler step along its own path",
+        ),
+        (
+            ["generator=imf", "evaluation.nfe=[2,5]"],
+            r"2 or 5 calls of $v_\theta$",
+            "infer2, infer5: steps of $v$",
+        ),
+        (["generator=imf_plain"], "improved Mean Flow", "Improved Mean Flow: what is learnt"),
         (["generator=imle", "evaluation.nfe=[1]"], "one-step IMLE", "IMLE: what is learnt"),
         (
             ["encoder=resnet18_attnres", "scale=paper"],
@@ -105,6 +118,24 @@ def test_other_methods_are_named_and_their_text_fits(overrides, overview, compon
         figure = draw(config)
         assert any(text in line for line in texts(figure))
         assert not clipped(figure)
+
+
+def test_every_generator_that_can_be_chosen_has_its_words_in_both_figures():
+    choices = [yaml.safe_load(path.read_text()) for path in (CONFIG_DIRECTORY / "generator").glob("*.yaml")]
+    classes = {
+        one["_target_"].rpartition(".")[2] for one in choices if "_target_" in one
+    }  # others vary these
+    assert classes <= set(GENERATOR)
+    assert classes <= {*LEARNS, "ActionChunking"}  # whose loss its core has
+
+
+def test_steps_that_follow_no_average_are_not_drawn_as_one(config):
+    """At `boundary_share=1` one step is taken with u, and more with v."""
+    assert config["generator"]["boundary_share"] == 1
+    seen = texts(method_components(config))
+    assert {"infer1", "infer2, infer3: steps of $v$"} <= set(seen)
+    seen = texts(method_components(changed(config, "generator.boundary_share", 0.9)))
+    assert {"infer1", "infer2", "infer3"} <= set(seen)
 
 
 @pytest.mark.parametrize("conditioning", ["token", "adaln", "cross"])

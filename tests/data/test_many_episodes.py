@@ -1,0 +1,180 @@
+"""Windows and statistics are computed in blocks: equal to those of an index that is held whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from any_robot import MemorySource, names_of, robot_of_size
+
+from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Statistics, Windows
+from imfvla.horizon import Horizon
+from imfvla.instruction import tokenize
+from imfvla.statistics import RunningStatistics
+
+ROBOT = robot_of_size(7, 9)
+HORIZONS = [(1, 1, 1), (1, 8, 4), (2, 8, 8), (3, 40, 5)]
+CHOSEN = [None, (0, 2, 3, 5), (1, 3)]
+ROUNDING = {"rtol": 1e-6, "atol": 1e-7}  # some units in the last place of float32
+
+
+class Gaps(MemorySource):
+    """Episodes of different lengths, sentences and steps with frames; one of them has no frames at all."""
+
+    def __init__(self) -> None:
+        super().__init__(ROBOT, num_episodes=6, num_steps=31)
+        taken = (range(31), range(0, 31, 2), (), (0, 1, 2, 7, 8, 9, 20), range(1, 31), range(5))
+        for number, (episode, steps) in enumerate(zip(self.episodes, taken, strict=True)):
+            length = 31 - 3 * number
+            kept = np.array([step for step in steps if step < length], np.int64)
+            size = (len(kept), ROBOT.cameras[0].height, ROBOT.cameras[0].width, 3)
+            pictures = np.random.default_rng(number).integers(256, size=size, dtype=np.uint8)
+            sentences = ("move it", "push it", "move it", f"way {number // 2}")[: 1 + number]
+            self.episodes[number] = replace(
+                episode,
+                state=episode.state[:length],
+                action=episode.action[:length],
+                image_steps=kept,
+                images={ROBOT.cameras[0].name: pictures},
+                instructions=sentences,
+            )
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> FrameStore:
+    path = tmp_path_factory.mktemp("gaps") / "store"
+    return FrameStore.build(Gaps(), path, (8, 8), names_of(ROBOT.cameras))
+
+
+class Held:
+    """The definition: one window after the other, all rows held in memory."""
+
+    def __init__(self, store: FrameStore, horizon: Horizon, paraphrases: bool, chosen) -> None:
+        self.store = store
+        episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []
+        for number in sorted(range(len(store.episodes)) if chosen is None else chosen):
+            episode = store.episodes[number]
+            frame_at = np.full(episode.num_steps, -1)
+            frame_at[episode.image_steps] = episode.first_frame + np.arange(len(episode.image_steps))
+            for step in episode.image_steps.tolist():
+                seen = np.maximum(np.arange(step - horizon.obs + 1, step + 1), 0)
+                if (frame_at[seen] < 0).any():
+                    continue
+                after = np.arange(step, step + horizon.pred)
+                episodes.append(number)
+                steps.append(step)
+                frames.append(frame_at[seen])
+                observed.append(episode.first_row + seen)
+                followed.append(episode.first_row + np.minimum(after, episode.num_steps - 1))
+                valid.append(after < episode.num_steps)
+        self.episodes, self.steps = np.array(episodes), np.array(steps)
+        self.frames, self.observed, self.followed = np.array(frames), np.array(observed), np.array(followed)
+        self.valid = np.array(valid)
+        said = [
+            list(dict.fromkeys(episode.instructions if paraphrases else episode.instructions[:1]))
+            for episode in store.episodes
+        ]
+        self.first = np.cumsum([0, *map(len, said)])
+        self.number = np.array([len(sentences) for sentences in said])
+        self.words = np.stack([tokenize(sentence) for sentences in said for sentence in sentences])
+
+    def batch(self, indices: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+        episodes = self.episodes[indices]
+        words = self.words[self.first[episodes] + rng.integers(self.number[episodes])]
+        rows = self.store.state[self.observed[indices]], self.store.action[self.followed[indices]]
+        return self.store.images[self.frames[indices]], words, *rows, self.valid[indices]
+
+
+def parts(batch) -> tuple[torch.Tensor, ...]:
+    return batch.obs.images, batch.obs.instruction, batch.obs.state, batch.actions, batch.valid
+
+
+@pytest.mark.parametrize("chosen", CHOSEN)
+@pytest.mark.parametrize("paraphrases", [True, False])
+@pytest.mark.parametrize("horizon", HORIZONS)
+def test_windows_and_batches_are_those_of_an_index_held_whole(store, horizon, paraphrases, chosen):
+    horizon = Horizon(*horizon)
+    windows = Windows(store, horizon, ROBOT, paraphrases=paraphrases, episodes=chosen)
+    held = Held(store, horizon, paraphrases, chosen)
+    assert len(windows) == len(held.steps)
+    episodes, steps = windows.decisions(np.arange(len(windows)))
+    np.testing.assert_array_equal(episodes, held.episodes)
+    np.testing.assert_array_equal(steps, held.steps)
+    sampler = ResumableSampler(len(windows), 5, seed=3)
+    for number in range(2 * len(windows) // 5):
+        indices = sampler.batch(number)
+        found = parts(windows.batch(indices, np.random.default_rng(number)))
+        for part, wanted in zip(found, held.batch(indices, np.random.default_rng(number)), strict=True):
+            assert part.numpy().dtype == wanted.dtype
+            np.testing.assert_array_equal(part.numpy(), wanted)
+        state, actions, valid = windows.decided(indices)
+        np.testing.assert_array_equal(state, store.state[held.observed[indices, -1]])
+        np.testing.assert_array_equal(actions, found[3])
+        np.testing.assert_array_equal(valid, found[4])
+
+
+def test_a_loader_hands_out_the_same_batches(store):
+    windows, held = (
+        Windows(store, Horizon(2, 8, 4), ROBOT),
+        Held(store, Horizon(2, 8, 4), True, None),
+    )
+    with Loader(windows, ResumableSampler(len(windows), 6, seed=1), augment=Augmentation()) as loader:
+        for number in range(4):
+            rng = np.random.default_rng(np.random.SeedSequence([1, 1, number]))
+            images, *others = held.batch(ResumableSampler(len(windows), 6, seed=1).batch(number), rng)
+            found = parts(next(loader))
+            np.testing.assert_array_equal(found[0], Augmentation()(torch.from_numpy(images), rng))
+            for part, wanted in zip(found[1:], others, strict=True):
+                np.testing.assert_array_equal(part, wanted)
+
+
+def assert_close(found: Statistics, wanted: Statistics) -> None:
+    for name in Statistics.__slots__:
+        part = getattr(found, name)
+        assert part.dtype == np.float32
+        limit = {"rtol": 0, "atol": 0} if name.endswith(("min", "max")) else ROUNDING
+        np.testing.assert_allclose(part, getattr(wanted, name), **limit, err_msg=name)
+
+
+@pytest.mark.parametrize("chosen", CHOSEN)
+@pytest.mark.parametrize("horizon", [*HORIZONS, (1, 100, 1)])
+def test_statistics_are_those_of_all_displacements_at_once(store, horizon, chosen):
+    held = Held(store, Horizon(*horizon), True, chosen)
+    numbers = range(len(store.episodes)) if chosen is None else chosen
+    rows = np.concatenate(
+        [np.arange(one.num_steps) + one.first_row for one in map(store.episodes.__getitem__, numbers)]
+    )
+    displaced = store.action[held.followed] - store.state[held.observed[:, -1:]][..., ROBOT.origin]
+    wanted = Statistics.of(store.state[rows], store.action[rows], displaced, held.valid)
+    assert_close(Windows(store, Horizon(*horizon), ROBOT, episodes=chosen).statistics(), wanted)
+
+
+@pytest.mark.parametrize("far", [0.0, 1000.0])
+def test_small_displacements_far_from_zero_keep_their_deviation(far):
+    rng = np.random.default_rng(0)
+    origin, pred, length = np.array([1, 1, 0]), 16, 90
+    running = RunningStatistics(origin, pred)
+    states, actions, displaced, valid = [], [], [], []
+    for number in range(20):
+        state = (far + number + rng.normal(size=(length, 2)).cumsum(axis=0)).astype(np.float32)
+        action = state[:, origin] + np.float32([0.5, 0, 0]) + rng.normal(size=(length, 3)) * [0, 1e-3, 1]
+        action = action.astype(np.float32)
+        running.add(state, action, np.arange(length))
+        steps = np.arange(length)[:, None] + np.arange(pred)
+        states.append(state)
+        actions.append(action)
+        displaced.append(action[np.minimum(steps, length - 1)] - state[:, None, origin])
+        valid.append(steps < length)
+    whole = map(np.concatenate, (states, actions, displaced, valid))
+    found, wanted = running.result(), Statistics.of(*whole)
+    assert_close(found, wanted)
+
+
+def test_a_channel_that_never_moves_has_no_deviation():
+    running = RunningStatistics(np.zeros(1, int), 4)
+    for _ in range(3):
+        running.add(np.full((9, 1), 0.1, np.float32), np.full((9, 1), 0.7, np.float32), np.arange(9))
+    found = running.result()
+    assert (found.displacement_std == 0).all()
+    assert found.state_std == found.action_std == 0
+    np.testing.assert_allclose(found.displacement_mean, 0.6, rtol=1e-6)
