@@ -13,7 +13,7 @@ from imfvla import components
 from imfvla.construction import allowed_class, construct
 from imfvla.environments import environment_of
 from imfvla.errors import UserError
-from imfvla.fingerprint import fingerprint
+from imfvla.fingerprint import fingerprint, packages
 from imfvla.policy import build_policy
 from imfvla.run_directory import DONE, RunDirectory
 from imfvla.sources import EpisodeSource
@@ -76,7 +76,9 @@ def mark(tmp_path, monkeypatch) -> Path:
     (folder / "entry_points.txt").write_text(POINTS)
     (tmp_path / "outside_parts.py").write_text(MODULE.format(mark=str(mark)))
     monkeypatch.syspath_prepend(tmp_path)
+    packages.cache_clear()
     yield mark
+    packages.cache_clear()
     sys.modules.pop("outside_parts", None)
 
 

@@ -62,7 +62,7 @@ def test_it_holds_every_module_config_and_table_and_nothing_else(unpacked):
     assert modules == files(ROOT / "imfvla", "*.py")
     assert files(package / "conf", "*.*") == files(ROOT / "conf", "*.yaml")
     assert files(package / "experiments", "*.*") == {
-        Path("tables.yaml"), *(Path("paper", f"table{number}.csv") for number in (1, 2, 3))
+        Path("tables.yaml"), *(Path("paper", f"{name}.csv") for name in ("published", "table1", "table2", "table3"))
     }  # fmt: skip
     assert files(package / "reporting", "page.*") == files(ROOT / "imfvla" / "reporting", "page.*")
     assert {path.name.partition("-")[0] for path in unpacked.iterdir()} == {"imfvla"}
@@ -70,7 +70,7 @@ def test_it_holds_every_module_config_and_table_and_nothing_else(unpacked):
 
 def test_every_command_is_a_script(unpacked):
     text = next(unpacked.glob("*.dist-info/entry_points.txt")).read_text()
-    for name in ("bench", "collect", "compare", "evaluate", "gallery", "report", "train"):
+    for name in ("bench", "collect", "compare", "convert", "evaluate", "gallery", "report", "train"):
         assert f"imfvla-{name} = imfvla.scripts:{name}\n" in text
 
 
