@@ -84,7 +84,7 @@ def write_store(episodes: int, folder: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
     with open(path / IMAGES, "wb") as stream:
         stream.truncate(rows * len(views) * 3 * math.prod(SIZE))
-    np.save(path / "image_steps.npy", np.tile(np.arange(STEPS), episodes))
+    np.save(path / "image_steps.npy", np.tile(np.arange(STEPS), episodes), allow_pickle=False)
     state = open_memmap(path / "state.npy", "w+", np.float32, (rows, len(robot.state)))
     action = open_memmap(path / "action.npy", "w+", np.float32, (rows, len(robot.action)))
     for index in range(episodes):
