@@ -19,6 +19,7 @@ from imfvla.reporting.runs import Evaluation
 
 COLUMNS, PANEL, LEGEND_LINE = 3, 1.9, 0.165  # panels in a row, inches, inches
 TITLE, NAME = 36, 38  # characters a line
+WIDE = 8  # ratio of an axis's ends from which fewer ticks have numbers
 OUTPUTS = {"data": "clean action as output", "velocity": "velocity as output"}  # by parametrisation
 # what gives the loss of a generator other units: curves that differ in it are not compared
 UNITS = (
@@ -57,7 +58,8 @@ def _panel(axes: Axes, title: str, curves: Curves) -> None:
     axes.set_yscale("log")
     for number, (label, (steps, loss)) in enumerate(curves.items()):
         axes.plot(steps, loss, label=label, linewidth=1.2, **look(number) | {"marker": ""})
-    plain_log_ticks(axes.yaxis, (1, 2, 3, 4, 5, 6, 8))
+    low, high = axes.get_ylim()
+    plain_log_ticks(axes.yaxis, (1, 2, 5) if high > WIDE * low else (1, 2, 3, 4, 5, 6, 8))
     if curves:
         axes.figure.legend(loc="outside lower left", fontsize=7.5, borderpad=0, labelspacing=0.3)
     else:
