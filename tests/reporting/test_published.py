@@ -16,4 +16,4 @@ def test_a_published_rate_heads_the_table():
     (cells,) = table.rows
     assert cells[COLUMNS.index("Source")] == "published"
     assert cells[COLUMNS.index("Success-like")] == "32%"
-    assert "Published: ACT, arXiv 2304.13705, Table I." in table.notes
+    assert "Published: ACT, arXiv 2304.13705." in table.notes
