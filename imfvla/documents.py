@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 
 MAX_JSON_BYTES = 64 * 2**20
 MAX_YAML_DEPTH = 64
@@ -31,7 +31,7 @@ def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
         if mapping and not isinstance(value, dict):
             raise ValueError(f"wanted a mapping, found {type(value).__name__}")
     except PermissionError as error:  # a file that may be intact must not be deleted
-        raise UserError(f"{path} cannot be read: {error.strerror}; check its permissions.") from error
+        raise unreadable(path, error) from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as JSON: {error}; {remedy}.") from error
     return value

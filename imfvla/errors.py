@@ -2,6 +2,7 @@
 
 import errno
 import os
+from pathlib import Path
 
 
 class UserError(ValueError):
@@ -51,3 +52,8 @@ def as_user_error(error: BaseException, remedies: dict[int, str] = REMEDIES) -> 
             )
         cause = cause.__cause__
     return None
+
+
+def unreadable(path: Path, error: PermissionError) -> UserError:
+    """The error of a file that may not be read. It may be intact, so that it is not called damaged."""
+    return UserError(f"{path} cannot be read: {error.strerror or error}; check its permissions.")

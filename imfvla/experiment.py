@@ -95,7 +95,7 @@ def _check_environment(config: Mapping[str, Any]) -> None:
 
 
 def _check_source(config: Mapping[str, Any]) -> None:
-    """Raises UserError where the episodes to learn from cannot be had, or are of another robot; records none."""
+    """Raises UserError where the episodes to learn from do not exist, or are of another robot; records none."""
     if source_kind(config) == SCRIPTED:
         require(
             has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED

@@ -3,7 +3,7 @@
 import math
 import types
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -53,7 +53,7 @@ SHARE_BELOW_1 = Limit("in [0, 1)", lambda value: 0 <= value < 1)
 
 
 def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
-    """`cls(**values)` for a dataclass of numbers, texts, flags and tuples of them.
+    """`cls(**values)` for a dataclass of numbers, texts, flags, other such dataclasses and tuples of them.
 
     `where` is the config key of `values`, such as "training", or "" at the top; it heads every message. Whole numbers
     are taken for float fields, lists for tuples. Raises UserError naming the key, what was wanted and what was found:
@@ -125,6 +125,8 @@ def convert(value: Any, hint: Any, key: str, prefix: str = "") -> Any:
         if rest and rest != [Ellipsis]:
             require(len(value) == 1 + len(rest), key, f"a list of {1 + len(rest)} entries", value)
         return tuple(convert(item, element, f"{key}[{index}]") for index, item in enumerate(value))
+    if is_dataclass(hint):
+        return build(hint, value, key)
     if hint is Any:
         return value
     require(_FITS[hint](value), key, prefix + _KINDS[hint], value)

@@ -138,30 +138,9 @@ class RobotSpec:
 
         Raises UserError naming what is missing, unknown or of another type.
         """
-        require(isinstance(values, Mapping), where, "a mapping of keys to values", values)
-        if "cameras" not in values:
+        if isinstance(values, Mapping) and "cameras" not in values:
             raise UserError(f"Missing key {where}.cameras: list its cameras, or [] for none.")
-        cameras = values["cameras"]
-        require(isinstance(cameras, list | tuple), f"{where}.cameras", "a list", cameras)
-        seen = tuple(
-            build(Camera, camera, f"{where}.cameras[{number}]") for number, camera in enumerate(cameras)
-        )
-        return cls(
-            **asdict(build(_Channels, {k: v for k, v in values.items() if k != "cameras"}, where)),
-            cameras=seen,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Channels:
-    """The fields of a RobotSpec except its cameras, as `build` takes them."""
-
-    state: tuple[str, ...]
-    action: tuple[str, ...]
-    relative_to: tuple[int | None, ...]
-    action_min: tuple[float, ...]
-    action_max: tuple[float, ...]
-    control_hz: float
+        return build(cls, values, where)
 
 
 def bare_name(channel: str) -> str:

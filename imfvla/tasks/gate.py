@@ -1,4 +1,4 @@
-"""Gate: the right arm carries a short bar past a post that stands in its way: on either side of it, or over it."""
+"""Gate: the right arm carries a short bar past a post that blocks its way: on either side of it, or over it."""
 
 import numpy as np
 from dm_control import mjcf

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from imfvla.documents import parse_json, read_json
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.policy import Policy, build_policy
 from imfvla.robot import RobotSpec
@@ -188,10 +188,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
-    except PermissionError as error:  # a file that may be intact is not called damaged
-        raise UserError(
-            f"{path} cannot be read: {error.strerror or error}; check its permissions."
-        ) from error
+    except PermissionError as error:
+        raise unreadable(path, error) from error
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise  # the machine's fault, not the file's

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES
 from imfvla.recording.pictures import decode, size_of
 from imfvla.sources.checks import MAX_STEPS, bounded_pictures, misfit, missing_extra, numbers, shortened
@@ -32,7 +32,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing: wanted an HDF5 file there; correct the path.") from error
     except PermissionError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}; check its permissions.") from error
+        raise unreadable(path, error) from error
     except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
         reason = shortened(" ".join(str(error).split()))
         if "filter" in reason or "plugin" in reason:

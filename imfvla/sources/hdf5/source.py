@@ -73,7 +73,7 @@ class Options:
 
 
 class Hdf5Source:
-    """An `EpisodeSource` on a file or a folder of files; files are opened anew in each call."""
+    """An `EpisodeSource` on a file or a folder of files; each call opens its file itself."""
 
     robot: RobotSpec
 

@@ -23,7 +23,7 @@ TIME_TOLERANCE = 0.1  # of a period: how far a timestamp may lie from its step
 
 
 class LeRobotSource:
-    """An `EpisodeSource` on the folder of a LeRobotDataset v3; everything is opened anew in each call."""
+    """An `EpisodeSource` on the folder of a LeRobotDataset v3; each call opens its files itself."""
 
     robot: RobotSpec
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.sources.checks import MAX_EPISODES, MAX_STEPS, misfit, missing_extra, shortened
 from imfvla.sources.lerobot.layout import DOWNLOAD, INFO, TASKS, Info
 
@@ -220,7 +220,7 @@ def clear_errors(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing: wanted a parquet file there; {DOWNLOAD}.") from error
     except PermissionError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}; check its permissions.") from error
+        raise unreadable(path, error) from error
     except NotImplementedError as error:  # pyarrow's too
         raise UserError(
             f"{path} is not supported by pyarrow {pa.__version__} ({shortened(_line(error))}): rewrite it with LeRobot."

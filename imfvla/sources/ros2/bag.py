@@ -9,7 +9,7 @@ from typing import Any
 
 from mcap.records import Channel, Message, Schema
 
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.recording.mcap_file import missing_end, streamed_records
 from imfvla.sources.checks import misfit, missing_extra, shortened
 
@@ -161,7 +161,7 @@ def clear_errors(path: Path) -> Iterator[None]:
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing: wanted a bag there; copy the bag again.") from error
     except PermissionError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}; check its permissions.") from error
+        raise unreadable(path, error) from error
     except NotImplementedError as error:
         raise UserError(
             f"{path} has a message that is not supported: {error}; leave this topic out."
