@@ -62,7 +62,9 @@ def test_a_missing_row_is_marked_and_has_no_bar(results):
 
 def test_costs_are_shown_for_each_method_with_its_trainings(results):
     figure = success_by_cost(of_table(results, "dwell"))
-    calls, times = ([bars[0].get_xdata() for bars in axes.containers] for axes in figure.axes)
+    calls, times = (
+        [np.array(bars[0].get_xdata(), float) for bars in axes.containers] for axes in figure.axes
+    )
     for found in calls:
         assert list(np.round(found / found[0])) in ([1, 2, 10], [1])
     assert [list(found) for found in times].count(
