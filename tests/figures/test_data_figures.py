@@ -67,9 +67,8 @@ def test_costs_are_shown_for_each_method_with_its_trainings(results):
     )
     for found in calls:
         assert list(np.round(found / found[0])) in ([1, 2, 10], [1])
-    assert [list(np.round(found / found[0], 1)) for found in times].count([1, 1.7, 7.2]) == 4  # iMF twice, flow, DDIM
-        [6.5, 11.0, 47.0]
-    ) == 4  # two forms of iMF, flow matching, DDIM
+    several = [np.round(found / found[0], 1).tolist() for found in times if len(found) == 3]
+    assert several == 4 * [[1, 1.7, 7.2]]  # two forms of iMF, flow matching, DDIM
 
 
 def test_the_frontier_is_what_nothing_beats_in_both():
