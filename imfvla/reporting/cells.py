@@ -18,10 +18,12 @@ def with_its_interval(metric: Metric, result: Result) -> str:
     if result.is_missing:
         return MISSING
     measured = result.metrics[metric.name]
-    if metric.share is None:
-        return with_interval(measured, metric.digits)
-    share = result.metrics[metric.share].scaled(100)
-    return f"{measured.value}/{len(result.episodes)} {interval(share, 1, '%')}"
+    if metric.share is not None:
+        share = result.metrics[metric.share].scaled(100)
+        return f"{measured.value}/{len(result.episodes)} {interval(share, 1, '%')}"
+    if metric.estimate is None:
+        return number(measured.value, metric.digits)
+    return with_interval(measured, metric.digits)
 
 
 def alone(metric: Metric, summary: Mapping[str, Any]) -> str:
