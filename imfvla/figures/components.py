@@ -108,7 +108,7 @@ def _average(sheet: Sheet, method: Method) -> None:
         sheet.text(104, 58.6 - 2.7 * index, f"infer{nfe}", size=8, color=color, weight="bold", ha="left")
     if method.instant_nfe:
         names = ", ".join(f"infer{nfe}" for nfe in method.instant_nfe)
-        sheet.text(104, 58.6 - 2.7 * len(counts), f"{names}: first along $u$, then $v$", 21, size=7, ha="left")
+        sheet.text(104, 58.6 - 2.7 * len(counts), f"{names}: steps of $v$", 21, size=7, ha="left")
     elif not counts:
         sheet.text(104, 58.6, f"infer{method.nfe[0]}: no average is used", size=7, ha="left")
 

@@ -95,7 +95,7 @@ class Method:
 
     @property
     def instant_nfe(self) -> tuple[int, ...]:
-        """Those of `nfe` whose steps but the first follow the instantaneous velocity although an average is learned."""
+        """Those of `nfe` whose steps follow the instantaneous velocity although an average is learned."""
         if not self.is_staged or self.boundary_share is None or self.boundary_share < 1:
             return ()
         return tuple(nfe for nfe in self.nfe if nfe > 1)

@@ -132,7 +132,9 @@ def _calls(method: Method, rows: tuple[int, ...]) -> str:
     """How often the network is called, and for which velocity where it has two."""
     if not method.instant_nfe:
         return f"{listing(rows)} {'call' if rows == (1,) else 'calls'} of the network"
-    return r"one call of $u_\theta$" if rows == (1,) else r"the first call gives $u_\theta$, the others $v_\theta$"
+    if 1 in rows:
+        return r"one call of $u_\theta$, or more of $v_\theta$"
+    return rf"{listing(rows)} calls of $v_\theta$"
 
 
 def _steps(sheet: Sheet, left: float, right: float, y: float, nfe: int) -> None:

@@ -100,8 +100,8 @@ def test_the_components_are_those_configured(config, key, value):
         ),
         (
             ["generator=imf", "evaluation.nfe=[2,5]"],
-            r"the first call gives $u_\theta$, the others $v_\theta$",
-            "infer2, infer5: first along $u$, then $v$",
+            r"2 or 5 calls of $v_\theta$",
+            "infer2, infer5: steps of $v$",
         ),
         (["generator=imf_plain"], "improved Mean Flow", "Improved Mean Flow: what is learnt"),
         (["generator=imle", "evaluation.nfe=[1]"], "one-step IMLE", "IMLE: what is learnt"),
@@ -130,10 +130,10 @@ def test_every_generator_that_can_be_chosen_has_its_words_in_both_figures():
 
 
 def test_steps_that_follow_no_average_are_not_drawn_as_one(config):
-    """At `boundary_share=1` the first of several steps goes along u, the others along v."""
+    """At `boundary_share=1` one step is taken with u, and more with v."""
     assert config["generator"]["boundary_share"] == 1
     seen = texts(method_components(config))
-    assert {"infer1", "infer2, infer3: first along $u$, then $v$"} <= set(seen)
+    assert {"infer1", "infer2, infer3: steps of $v$"} <= set(seen)
     seen = texts(method_components(changed(config, "generator.boundary_share", 0.9)))
     assert {"infer1", "infer2", "infer3"} <= set(seen)
 
