@@ -9,7 +9,7 @@ import math
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from imfvla.data.checksums import checked_sums, digest_of, with_checksums
 from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.files import locked, write_remedy
@@ -26,7 +27,8 @@ from imfvla.sources.validation import check_episode
 
 FORMAT = 2
 IMAGES = "images.raw"
-FILES = {IMAGES, "image_steps.npy", "state.npy", "action.npy", "meta.json"}
+ARRAYS = (IMAGES, "image_steps.npy", "state.npy", "action.npy")
+FILES = {*ARRAYS, "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
 
 Progress = Callable[[int, int], None]  # called with (episodes done, episodes in all)
@@ -57,15 +59,24 @@ class FrameStore:
     image_steps: np.ndarray  # int64 (N,)  step of each frame within its episode, memory-mapped
     state: np.ndarray  # float32 (T, S), memory-mapped
     action: np.ndarray  # float32 (T, A)  clean, memory-mapped
+    content: Mapping[
+        str, str
+    ]  # what is trained on: a digest of each array, of the episodes and of their source
 
     @classmethod
     def open(cls, path: str | Path) -> "FrameStore":
-        """The store that `build` wrote to `path`. Raises UserError where there is none or it is damaged."""
+        """The store that `build` wrote to `path`, whose arrays are compared with their checksums once a process.
+
+        Raises UserError where there is none or it is damaged, naming file and block.
+        """
         path = Path(path)
         try:
             meta = read_json(path / "meta.json", "delete the store", mapping=True)
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
+            sums = checked_sums(path, meta, ARRAYS)
+            content = {name: digest_of(sums[name]) for name in ARRAYS}
+            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
@@ -86,7 +97,7 @@ class FrameStore:
                 "demos.frames_directory, and run again."
             ) from error
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
-        return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action)
+        return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action, content)
 
     @classmethod
     def build(
@@ -125,6 +136,12 @@ def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int
         "views": list(views),
         "image_size": list(image_size),
     }
+
+
+def _digest_of_episodes(meta: Mapping[str, Any]) -> str:
+    """Of what a training takes from meta.json: not the names, which only messages need."""
+    entries = [{key: entry[key] for key in entry if key != "name"} for entry in meta["episodes"]]
+    return digest_of([meta["views"], meta["image_size"], entries])
 
 
 def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
@@ -196,7 +213,8 @@ def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progr
     _save(part / "image_steps.npy", np.concatenate(steps))
     _save(part / "state.npy", np.concatenate(states))
     _save(part / "action.npy", np.concatenate(actions))
-    (part / "meta.json").write_text(json.dumps(meta | {"episodes": entries}, indent=1), encoding="utf-8")
+    meta = with_checksums(meta | {"episodes": entries}, part, ARRAYS)
+    (part / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
 
 
 def _save(path: Path, array: np.ndarray) -> None:
