@@ -25,7 +25,7 @@ from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.offline import print_offline
 from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
-from imfvla.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, plain
 from imfvla.same_robot import refuse_other_robot
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
@@ -181,7 +181,8 @@ def _train(
             "seed": seed,
             "num_parameters": num_parameters,
             "robot": robot_of(config).to_json(),
-            "config_digest": config_digest(config, EXECUTION_KEYS),
+            "config": plain(config),
+            "data": dict(windows.store.content),
         },
         processes=processes,
     )

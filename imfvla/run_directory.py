@@ -205,9 +205,14 @@ def step_of(steps: int, checkpoint: int | str) -> int:
 
 
 def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:
-    """16 hex digits that change with any key but the ignored ones."""
-    entries = {key: value for key, value in flatten(plain(config)).items() if not _is_ignored(key, ignored)}
-    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()[:16]
+    """16 hex digits that change with any key but the ignored ones and those that follow from others."""
+    return digest_of_entries(flatten(plain(config)), (*ignored, *DERIVED_KEYS))
+
+
+def digest_of_entries(entries: Mapping[str, Any], ignored: tuple[str, ...]) -> str:
+    """16 hex digits of dotted keys and their values, without the ignored keys and what is below these."""
+    kept = {key: value for key, value in entries.items() if not _is_below(key, ignored)}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> list[str]:
@@ -239,7 +244,11 @@ def plain(value: Any) -> Any:
 
 
 def _is_ignored(key: str, ignored: tuple[str, ...]) -> bool:
-    return any(key == name or key.startswith(f"{name}.") for name in (*ignored, *DERIVED_KEYS))
+    return _is_below(key, (*ignored, *DERIVED_KEYS))
+
+
+def _is_below(key: str, names: tuple[str, ...]) -> bool:
+    return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
 def _shown(flat: Mapping[str, Any], key: str) -> str:
