@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.fingerprint import code_version, describe_code
-from imfvla.run_directory import EXECUTION_KEYS, differences, plain
+from imfvla.storage.fingerprint import code_version, describe_code
+from imfvla.storage.run_directory import EXECUTION_KEYS, differences, plain
 
 CODE, EARLIER, CONFIG = "code", "earlier_code", "config"  # keys of a state, the second one of weights too
 log = logging.getLogger(__name__)
