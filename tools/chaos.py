@@ -11,6 +11,7 @@ stops                              Ctrl-C, SIGTERM and SIGUSR1 in the middle of 
 disk                               a full file system, a read-only one (both mounted, where permitted) and no file
                                    handles left
 workers                            worker processes that die and hang in the middle of an evaluation
+changes                            data, rows, numbers, config, weights and code that change silently
 
 Processes are forked after everything is imported, so that the signals hit the work itself. The policy is the tiny one
 of the tests (in a sweep a small one that is composed), and its environment replaces the simulator; loop,
@@ -35,6 +36,7 @@ import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "tests"), str(ROOT / "tests" / "training")]
+from faults.changes import changes  # noqa: E402
 from faults.disk import disk  # noqa: E402
 from faults.killing import kills_of  # noqa: E402
 from faults.outcome import Differs, demonstrations_of, rows_of, state_of  # noqa: E402
@@ -53,6 +55,7 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "stops": stops,
     "disk": disk,
     "workers": workers,
+    "changes": changes,
 }
 
 

@@ -18,10 +18,9 @@ from imfvla.storage.run_directory import (
     plain,
 )
 
-CONFIG, DIGEST = "config", "config_digest"  # keys of policy.json; evaluations have the second one
-REMEDY = (
-    "Restore config.yaml; to use another config, train or evaluate a copy of the run without its old results."
-)
+# Keys of policy.json. Evaluations have the second one, which weights of earlier versions have for the first one.
+CONFIG, DIGEST, DATA = "config", "config_digest", "data"
+REMEDY = "Restore config.yaml, or train with another config under another name=..."
 # Keys that digests began to leave out after the first version, in this order. A change of what is left out goes here.
 LEFT_OUT_LATER = (
     ("training.compile",),
@@ -42,10 +41,7 @@ def refuse_changed_config(run: RunDirectory, config: Mapping[str, Any], step: in
 
     Weights without `policy.json` beside them are not compared.
     """
-    beside = run.weights_directory(step) / "policy.json"
-    if not beside.exists():
-        return
-    made = read_json(beside, "restore it", mapping=True)
+    beside, made = _made_by(run, step)
     trained, digest = made.get(CONFIG), made.get(DIGEST)
     if isinstance(trained, Mapping):
         differing = differences(trained, plain(config), EXECUTION_KEYS)
@@ -54,7 +50,7 @@ def refuse_changed_config(run: RunDirectory, config: Mapping[str, Any], step: in
                 f"{run.path}/config.yaml is not what the weights of step {step} were trained with: "
                 f"{'; '.join(differing)}. {REMEDY}"
             )
-    elif digest is not None and not is_digest_of(config, digest):
+    if digest is not None and not is_digest_of(config, digest):
         raise UserError(
             f"{run.path}/config.yaml is not what the weights of step {step} were trained with: {beside} has "
             f"{DIGEST} {digest}, found {digest_of_config(config)}. {REMEDY}"
@@ -68,6 +64,19 @@ def refuse_other_config(config: Mapping[str, Any], run: Path, file: Path, digest
             f"{run}/config.yaml is not what {file} was evaluated with: it has {DIGEST} {digest}, found "
             f"{digest_of_config(config)}. {REMEDY}"
         )
+
+
+def trained_data(run: RunDirectory, step: int) -> Mapping[str, str] | None:
+    """Digests of the data that the weights of `step` were trained on; None where they do not say it."""
+    _, made = _made_by(run, step)
+    data = made.get(DATA)
+    return data if isinstance(data, Mapping) else None
+
+
+def _made_by(run: RunDirectory, step: int) -> tuple[Path, dict[str, Any]]:
+    """What the weights of `step` say of their training, and the file that says it; {} where it is missing."""
+    path = run.weights_directory(step) / "policy.json"
+    return path, read_json(path, "restore it", mapping=True) if path.exists() else {}
 
 
 def is_digest_of(config: Mapping[str, Any], digest: Any) -> bool:

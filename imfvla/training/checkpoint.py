@@ -28,6 +28,7 @@ from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.storage.documents import parse_json, read_json
 from imfvla.storage.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.trained_config import refuse_changed_config
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"
@@ -142,10 +143,12 @@ def load_weights(policy: nn.Module, path: Path) -> None:
 def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
     """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients.
 
-    Raises UserError where the weights do not fit the run's config, or were trained for another robot.
+    Raises UserError where the weights do not fit the run's config, or were trained with another one or for another
+    robot.
     """
-    step = run.weights_step(step)
-    policy = build_policy(run.config(), statistics=None)
+    step, config = run.weights_step(step), run.config()
+    refuse_changed_config(run, config, step)
+    policy = build_policy(config, statistics=None)
     if policy.has_stages:
         policy.begin_step(step - 1, run.training_steps())  # the last one that these weights have learned from
     path = run.policy_weights(step)
