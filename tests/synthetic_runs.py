@@ -63,7 +63,7 @@ def write_evaluation(
     """A finished evaluation in `run`; returns its folder. `protocol` changes what summary.json says of it."""
     rows = episodes_of(quality, first_seed, number, task=task, latency_ms=latency_ms, stream=stream)
     config = yaml.safe_load((run / "config.yaml").read_text())
-    name, weights = config["name"], f"{config['seed']:016x}"
+    name, weights = config["name"], f"{config.get('seed', 0):016x}"
     seeds = [first_seed, first_seed + number - 1]
     summary = summarise(rows) | {
         "experiment": name, "nfe": nfe, "checkpoint_step": step, "seeds": seeds,

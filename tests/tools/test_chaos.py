@@ -25,6 +25,12 @@ def test_killed_and_stopped_work_comes_back_to_the_same_result():
     assert "exit codes [130, 138, 143]" in printed
 
 
+def test_silent_changes_are_refused_by_name_or_change_nothing():
+    printed = chaos("changes")
+    assert printed.startswith("changes: 3 changes of a training's data")
+    assert "all refused by name, or without effect" in printed
+
+
 def test_a_killed_sweep_comes_to_the_same_end():
     assert "parts of 2 runs equal bit for bit" in chaos("sweep")
 
