@@ -2,7 +2,7 @@
 
 import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isclose
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from imfvla.reporting.metrics import Row, summarise
 
 EPISODES = "episodes.jsonl"
 DIGEST = "episodes_digest"  # key of summary.json; evaluations from before it have none
+RECORDINGS = "recordings"  # key of summary.json, with the returns of the episodes that were recorded
 OF_SOME_TASKS = ("success_of_goal",)  # metrics that not every evaluation has
 log = logging.getLogger(__name__)
 
@@ -45,12 +46,28 @@ def recomputed(folder: Path, summary: Mapping[str, Any]) -> tuple[dict[str, Any]
             f"{folder / EPISODES} gives another {', '.join(wrong)} than its summary.json: one was changed; {REMEDY}."
         )
     rest = {key: value for key, value in summary.items() if key not in (*metrics, *OF_SOME_TASKS)}
+    if isinstance(recordings := summary.get(RECORDINGS), Mapping):
+        rest[RECORDINGS] = _with_returns(folder, recordings, rows)
     return metrics | rest, rows
 
 
 def digest_of(path: Path) -> str:
     """16 hex digits of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def _with_returns(folder: Path, recordings: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
+    """The recorded episodes with the returns of their rows. Raises UserError where one has no row."""
+    returns = {row["seed"]: row["total_reward"] for row in rows}
+    for label, recording in recordings.items():
+        if recording["seed"] not in returns:
+            raise UserError(
+                f"{folder}/summary.json: the recording {label} is of seed {recording['seed']}, which {EPISODES} lacks: "
+                f"{REMEDY}."
+            )
+    return {
+        label: {**recording, "return": returns[recording["seed"]]} for label, recording in recordings.items()
+    }
 
 
 def _refuse_contradictions(folder: Path, summary: Mapping[str, Any]) -> None:

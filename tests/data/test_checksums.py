@@ -8,9 +8,9 @@ import shutil
 import numpy as np
 import pytest
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import FrameStore, Loader, ResumableSampler, Windows, checksums
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
 from imfvla.sources.mcap import McapSource
 
 VIEWS = ("front", "top")
