@@ -1,10 +1,9 @@
 """What the checksums of frame stores cost: processor time, which other processes on the machine change little.
 
-python tools/checksums.py                     # decoding demonstrations into a store, with and without checksums
-python tools/checksums.py data/demos/..._frames_96x96   # checking a store, as every training does when it starts
+python tools/checksums.py data/demos/FOLDER
 
-Demonstrations are recorded without a simulator, at the size and number of views that experiments use. Prints one line
-of JSON. Neither a step of training nor a recording runs any of this code.
+Decodes the first recordings of a folder into a store, with and without checksums, and checks the store, as every
+training does when it starts. Prints one line of JSON. Neither a step of training nor a recording runs any of this code.
 """
 
 from imfvla.command import as_command, begin
@@ -23,48 +22,40 @@ from unittest import mock
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "tests")]
-from synthetic import VIEWS, write_demonstrations  # noqa: E402
+from imfvla.data import FrameStore, checksums
+from imfvla.data.frame_store import ARRAYS
+from imfvla.recording import Recordings
+from imfvla.sources.mcap import McapSource
 
-from imfvla.data import FrameStore, checksums  # noqa: E402
-from imfvla.data.frame_store import ARRAYS, IMAGES  # noqa: E402
-from imfvla.sources.mcap import McapSource  # noqa: E402
-
-SIZE, EPISODES, STEPS, REPEATS = (96, 96), 8, 200, 3
+EPISODES, REPEATS = 8, 3
 
 
-def building(folder: Path) -> dict[str, float]:
-    """Seconds to decode some demonstrations, the median of a few times, with and without checksums."""
-    write_demonstrations(folder / "demos", num_episodes=EPISODES, num_steps=STEPS, image_size=SIZE)
-    source = McapSource.of(folder / "demos")
-    taken: dict[str, list[float]] = {"with": [], "without": []}
+def measure(recordings: Path, scratch: Path) -> dict[str, float]:
+    """Seconds, each the median of a few times."""
+    names = [path.name for path in Recordings.of(recordings).files[:EPISODES]]
+    source = McapSource(Recordings.named(recordings, names, "measured"))
+    camera = source.robot.cameras[0]
+    views, size = tuple(camera.name for camera in source.robot.cameras), (camera.height, camera.width)
+    taken: dict[str, list[float]] = {"build_s": [], "build_without_s": [], "check_s": []}
     for number in range(REPEATS):
-        for kind in taken:
+        for name in ("build_s", "build_without_s"):
+            store = scratch / f"{number}-{name}"
             with mock.patch.object(
-                checksums, "block_sums", checksums.block_sums if kind == "with" else no_sums
+                checksums, "block_sums", checksums.block_sums if name == "build_s" else no_sums
             ):
-                path = folder / f"store-{number}-{kind}"
-                taken[kind].append(seconds(lambda path=path: FrameStore.build(source, path, SIZE, VIEWS)))
-    medians = {kind: float(np.median(values)) for kind, values in taken.items()}
-    size = (folder / "store-0-with" / IMAGES).stat().st_size
+                taken[name].append(seconds(lambda path=store: FrameStore.build(source, path, size, views)))
+        store = scratch / f"{number}-build_s"
+        taken["check_s"].append(
+            seconds(lambda path=store: [checksums.block_sums(path / name) for name in ARRAYS])
+        )
+    num_bytes = sum((store / name).stat().st_size for name in ARRAYS)
+    medians = {name: float(np.median(values)) for name, values in taken.items()}
     return {
-        "store_gb": round(size / 1e9, 3),
-        "build_s": round(medians["with"], 2),
-        "build_without_s": round(medians["without"], 2),
-        "slower": round(medians["with"] / medians["without"] - 1, 4),
-    }
-
-
-def checking(store: Path) -> dict[str, float]:
-    """Seconds to read a store and compare it, the median of a few times."""
-    size = sum((store / name).stat().st_size for name in ARRAYS)
-    taken = [seconds(lambda: [checksums.block_sums(store / name) for name in ARRAYS]) for _ in range(REPEATS)]
-    middle = float(np.median(taken))
-    return {
-        "store_gb": round(size / 1e9, 3),
-        "check_s": round(middle, 2),
-        "s_per_gb": round(1e9 * middle / size, 2),
+        "episodes": len(names),
+        "store_mb": round(num_bytes / 1e6, 1),
+        **{name: round(value, 3) for name, value in medians.items()},
+        "build_slower": round(medians["build_s"] / medians["build_without_s"] - 1, 4),
+        "check_s_per_gb": round(1e9 * medians["check_s"] / num_bytes, 2),
     }
 
 
@@ -81,13 +72,9 @@ def no_sums(path: Path) -> list[str]:
 @as_command
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("store", nargs="?", type=Path, help="a frame store; by default one is made")
-    store = parser.parse_args().store
-    if store is not None:
-        print(json.dumps(checking(store)))
-        return 0
-    with tempfile.TemporaryDirectory() as folder:
-        print(json.dumps(building(Path(folder))))
+    parser.add_argument("recordings", type=Path, help="a folder of demonstrations")
+    with tempfile.TemporaryDirectory() as scratch:
+        print(json.dumps(measure(parser.parse_args().recordings, Path(scratch))))
     return 0
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.data.checksums import checked_sums, digest_of, with_checksums
+from imfvla.data.checksums import checked_sums, digest_of, remember, with_checksums
 from imfvla.data.resample import resample
 from imfvla.errors import UserError
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
@@ -170,9 +170,10 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
                 "space, choose another disk with demos.frames_directory, or lower observation.image_size or the "
                 "number of views."
             )
-        _write_arrays(source, part, meta, progress)
+        written = _write_arrays(source, part, meta, progress)
         shutil.rmtree(store_path, ignore_errors=True)
         part.rename(store_path)
+        remember(store_path, written, ARRAYS)
     except OSError as error:
         raise UserError(
             f"Cannot write frame store {store_path}: {error.strerror or error}; choose another folder with "
@@ -193,7 +194,10 @@ def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
     return found
 
 
-def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress) -> None:
+def _write_arrays(
+    source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress
+) -> dict[str, Any]:
+    """Fills the folder `part`; returns the content of its meta.json."""
     entries, steps, states, actions = [], [], [], []
     with open(part / IMAGES, "wb") as stream:
         for episode, frames in _decoded(source, meta["views"], meta["image_size"]):
@@ -215,6 +219,7 @@ def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progr
     _save(part / "action.npy", np.concatenate(actions))
     meta = with_checksums(meta | {"episodes": entries}, part, ARRAYS)
     (part / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    return meta
 
 
 def _save(path: Path, array: np.ndarray) -> None:

@@ -51,7 +51,11 @@ class RolloutLog:
             raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.")
         self._stream = None
         self.rows: list[dict[str, Any]] = []
-        self.summary = None if self._overwrite else self._finished()
+        try:
+            self.summary = None if self._overwrite else self._finished()
+        except BaseException:
+            os.close(self._lock)
+            raise
         return self
 
     def begin(self, **conditions: Any) -> None:

@@ -18,6 +18,8 @@ class Origin:
 
     def __init__(self, config: Mapping[str, Any] | None) -> None:
         self._config = None if config is None else plain(config)
+        # Looked up now: files may change while it trains, the code that runs does not.
+        self._code = code_version()
         self._earlier: list[dict[str, Any]] = []  # {"until_step", "code"}, oldest first
 
     def resume(self, details: Mapping[str, Any], state: Path) -> None:
@@ -25,7 +27,7 @@ class Origin:
 
         Other code is a line in the log and stays on record. Raises UserError naming the keys of the config that differ.
         """
-        before, now = details.get(CODE), code_version()
+        before, now = details.get(CODE), self._code
         self._earlier = list(details.get(EARLIER, []))
         if before is not None and any(before.get(key) != now[key] for key in now):
             self._earlier.append({"until_step": details["step"], CODE: before})
@@ -45,4 +47,4 @@ class Origin:
 
     def to_json(self) -> dict[str, Any]:
         """For the details of a state."""
-        return {CODE: code_version(), CONFIG: self._config, **self.versions()}
+        return {CODE: self._code, CONFIG: self._config, **self.versions()}
