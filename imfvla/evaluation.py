@@ -1,6 +1,5 @@
 """Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -45,12 +44,9 @@ def evaluate(
         raise UserError(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
-    run.refuse_links_outside()
+    run.refuse_strangers()
     step = run.weights_step(options.checkpoint)
-    weights = run.policy_weights(step)
-    if not weights.exists():
-        raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
+    digest = run.weights_digest(step)
     count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
     summaries = []
     with worker_pool(count, options.episode_timeout_s) as run_all:

@@ -15,7 +15,7 @@ from imfvla.figures.learning import learning_curves
 from imfvla.figures.overview import method_overview
 from imfvla.figures.reward_latency import reward_latency
 from imfvla.figures.style import render
-from imfvla.files import copy_file, write_together
+from imfvla.files import write_together
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import COMPARISONS, TableTitle
@@ -42,13 +42,13 @@ class Publication:
 
     tables: tuple[Table, ...]
     files: dict[Path, bytes]
-    copies: dict[Path, Path]  # of files of runs that the page shows: copy -> original
+    copies: dict[
+        Path, tuple[Path, Path]
+    ]  # of files of runs that the page shows: copy -> original, run directory
 
     def write(self) -> list[Path]:
         """All files or none, after the copies. Raises UserError on a write error."""
-        for copy, original in self.copies.items():
-            copy_file(original, copy)
-        write_together(self.files)
+        write_together(self.files, self.copies)
         return list(self.files)
 
 

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from imfvla.environment import Environment, bodies_of
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.files import write_remedy
+from imfvla.files import make_folder, put_file, write_remedy
 from imfvla.recording import messages, schemas
 from imfvla.recording.channels import Channels, numbers
 from imfvla.recording.pictures import encode
@@ -46,8 +46,9 @@ class McapSink:
 
     def begin(self, env: Environment, info: EpisodeInfo) -> None:
         with self._cleaning_up():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = open(self._part, "wb")  # noqa: SIM115  closed by end or abort
+            make_folder(self.path.parent)
+            self._part.unlink(missing_ok=True)  # of a killed process, or a link to somewhere else
+            self._stream = open(self._part, "xb")  # noqa: SIM115  closed by end or abort
             self._writer = Writer(
                 self._stream, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
             )
@@ -107,7 +108,7 @@ class McapSink:
             self._writer.add_metadata(messages.RESULT_RECORD, messages.result_record(result, self._num_steps))
             self._writer.finish()
             self._stream.close()
-            self._part.replace(self.path)
+            put_file(self._part, self.path)
             self._stream = None
 
     def abort(self) -> None:

@@ -169,7 +169,7 @@ def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
 def read_evaluated(evaluation: Evaluation) -> Evaluated:
     """An evaluation with its episodes. Raises UserError where they are damaged or differ from the summary."""
     path = evaluation.folder / "episodes.jsonl"
-    episodes = read_episodes(path, evaluation.seeds)
+    episodes = read_episodes(path, evaluation.seeds, evaluation.run)
     for key, value in summarise(episodes).items():
         if key not in evaluation.summary:
             continue  # a metric that was added after the evaluation was made

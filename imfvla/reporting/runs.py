@@ -141,7 +141,7 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
+    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True, home=run.path)
     missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
     if missing:
         raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")

@@ -1,0 +1,1 @@
+"""Files on disk: what may be opened, and when a file counts as written."""
