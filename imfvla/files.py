@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from imfvla.errors import UserError
 from imfvla.storage.opening import kind_of, open_to_append, open_to_read
@@ -182,23 +182,38 @@ def _delete(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Waits until no other process holds the lock of `path`, a hidden file beside it, and holds it.
+    """Waits until no other process holds the lock of `path`, a hidden file beside it while work goes on, and holds it.
 
     Where none can be made, a warning names `path` and work starts without one; on a read-only file system there is
     nothing to wait for. Raises UserError where something else has the lock's name.
     """
+    lock = path.with_name(f".{path.name}.lock")
     with ExitStack() as held:
         try:
             make_folder(path.parent)
-            stream = held.enter_context(open_to_append(path.with_name(f".{path.name}.lock")))
+            while not _is_locked(held.enter_context(open_to_append(lock)), lock, path):
+                held.close()  # its holder has deleted it meanwhile
         except OSError as error:
             if error.errno != errno.EROFS:
                 _warn_unlocked(path, error)
         else:
-            if not take_lock(stream.fileno(), path):
-                log.info("%s is in use by another command: waiting for it.", path.parent)
-                take_lock(stream.fileno(), path, wait=True)
+            held.callback(_delete_lock, lock)
         yield
+
+
+def _delete_lock(lock: Path) -> None:
+    with suppress(OSError):
+        lock.unlink()
+
+
+def _is_locked(stream: IO[str], lock: Path, path: Path) -> bool:
+    """Waits for the lock of an open file, and says whether that is still the file at `lock`."""
+    if not take_lock(stream.fileno(), path):
+        log.info("%s is in use by another command: waiting for it.", path.parent)
+        take_lock(stream.fileno(), path, wait=True)
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(stream.fileno()), lock.stat())
+    return False
 
 
 def take_lock(descriptor: int, path: Path, *, wait: bool = False) -> bool:

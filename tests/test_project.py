@@ -93,7 +93,7 @@ MAY_IMPORT = {
     "episode": {"environment", "robot"},
     "horizon": set(),
     "protocol": {"options"},
-    "nn": {"torch", "options"},
+    "nn": {"torch", "options", "storage"},
     "encoders": {"torch", "instruction", "nn", "types"},
     "generators": {"torch", "nn", "options"},
     "robot": {"options"},
@@ -118,7 +118,7 @@ MAY_IMPORT = {
         "types",
     },
     "tasks": {"mujoco", "dm_control", "environment", "episode", "gl", "options", "robot", "views"},
-    "recording": {"documents", "environment", "episode", "files", "robot", "tasks"},
+    "recording": {"documents", "environment", "episode", "files", "robot", "tasks", "storage"},
     "reporting": {
         "assets",
         "documents",
@@ -129,7 +129,9 @@ MAY_IMPORT = {
         "robot",
         "run_directory",
         "run_names",
+        "storage",
     },
+    "storage": set(),
     "run_names": {"run_directory"},
     "figures": {"documents", "environments", "reporting", "robot", "robot_of"},
     "sources": {
@@ -143,6 +145,7 @@ MAY_IMPORT = {
         "robot",
         "same_robot",
         "tasks",
+        "storage",
     },
     "demonstrations": {
         "environment",
@@ -185,6 +188,7 @@ MAY_IMPORT = {
         "sources",
         "statistics",
         "types",
+        "storage",
     },
 }
 

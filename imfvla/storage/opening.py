@@ -131,7 +131,9 @@ def _open(path: Path, flags: int, home: Path | None) -> int:
 def _refuse_special(path: Path, mode: int) -> None:
     if not stat.S_ISREG(mode):
         found = SPECIAL.get(stat.S_IFMT(mode), "something else")
-        raise UserError(f"{path} must be a file, found {found}: remove it, or restore the file.")
+        raise UserError(
+            f"Wanted a file, found {found} at {path}: remove what has that name, or choose another directory."
+        )
 
 
 def _refuse_large(path: Path, size: int, kind: Kind) -> None:
