@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors, locked, make_folder, put_folder
+from imfvla.storage.files import clear_write_errors, locked, make_folder, put_folder
 
 
 class NewFolder:

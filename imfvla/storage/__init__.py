@@ -1,1 +1,1 @@
-"""Files on disk: what may be opened, and when a file counts as written."""
+"""Files on disk: bounded reading, whole-or-not-at-all writing, the run directory, what a result depends on."""

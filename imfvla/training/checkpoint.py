@@ -20,9 +20,13 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError, unreadable
-from imfvla.files import (
+from imfvla.policy import Policy, build_policy
+from imfvla.robot import RobotSpec
+from imfvla.robot_of import KEY
+from imfvla.sources.same_robot import refuse_other_robot
+from imfvla.storage.documents import parse_json, read_json
+from imfvla.storage.files import (
     PARTIAL,
     SCRATCH,
     clear_folder,
@@ -33,12 +37,8 @@ from imfvla.files import (
     write_atomically,
     write_json,
 )
-from imfvla.policy import Policy, build_policy
-from imfvla.robot import RobotSpec
-from imfvla.robot_of import KEY
-from imfvla.run_directory import RunDirectory
-from imfvla.same_robot import refuse_other_robot
 from imfvla.storage.opening import WEIGHTS, Kind, checked
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"

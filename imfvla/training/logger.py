@@ -8,11 +8,11 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors, make_folder, sync, write_text
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.documents import parse_json, read_lines
+from imfvla.storage.files import clear_write_errors, make_folder, sync, write_text
 from imfvla.storage.opening import open_to_append
+from imfvla.storage.run_directory import RunDirectory
 
 
 class MetricsLogger:

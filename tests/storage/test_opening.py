@@ -12,18 +12,17 @@ from synthetic_runs import make_run, write_evaluation
 from torch import nn
 
 from imfvla.data import FrameStore
-from imfvla.documents import read_json, read_lines, read_yaml
 from imfvla.errors import UserError
-from imfvla.files import copy_file, locked
 from imfvla.nn.pretrained import read_weights
 from imfvla.recording import Recordings, read_episode, read_index
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.media import Media
 from imfvla.reporting.runs import evaluations
-from imfvla.rollout_log import PARTIAL, RolloutLog
-from imfvla.run_directory import RunDirectory
-from imfvla.shipping import ship
+from imfvla.reporting.shipping import ship
+from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.documents import read_json, read_lines, read_yaml
+from imfvla.storage.files import copy_file, locked
 from imfvla.storage.opening import (
     JSON,
     OF_SUFFIX,
@@ -34,6 +33,7 @@ from imfvla.storage.opening import (
     open_to_read,
     refuse_strangers,
 )
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.run_log import RunLog
 from imfvla.training.checkpoint import load_weights, read_tensors
 from imfvla.training.logger import MetricsLogger, read_metrics

@@ -14,13 +14,13 @@ from imfvla import collection
 from imfvla.data import FrameStore
 from imfvla.episode import Decision
 from imfvla.errors import UserError
-from imfvla.files import clear_folder, copy_file, write_json, write_text, write_together
 from imfvla.recording import read_episode, write_mp4
 from imfvla.reporting.episodes import read_episodes
-from imfvla.rollout_log import PARTIAL, RolloutLog
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.mcap_writer import McapWriter
+from imfvla.storage.files import clear_folder, copy_file, write_json, write_text, write_together
+from imfvla.storage.run_directory import RunDirectory
 
 ROWS = episodes_of(0.6, 100_000, 3, task="socket", latency_ms=6.0)
 SMALL = {"views": ("front",), "image_size": (16, 16)}

@@ -4,7 +4,7 @@ import json
 
 from losing_disk import watch
 
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from faults.killing import POLL_S, ended_or_late, half_written, start, undisturbed
 from faults.outcome import Differs, compare, state_of
 from faults.work import train
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 MOST = 2  # a folder in which the library writes, and the file that was just moved out of it
 

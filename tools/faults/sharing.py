@@ -16,9 +16,9 @@ from faults.killing import last_words, start, undisturbed
 from faults.outcome import Differs, compare, rows_of, state_of
 from faults.work import roll_out, train
 from imfvla.data import FrameStore
-from imfvla.files import write_together
-from imfvla.run_directory import RunDirectory
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.files import write_together
+from imfvla.storage.run_directory import RunDirectory
 
 FILES, WRITERS = 40, 4
 

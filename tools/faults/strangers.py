@@ -1,4 +1,4 @@
-"""A run directory from outside with a link out of it, something that blocks, or a file without end in a file's place."""
+"""A run directory from outside: a link out of it, something that blocks, or a file without end in a file's place."""
 
 import os
 import random
@@ -14,10 +14,10 @@ from tiny_policy import TinyPolicy
 from faults.killing import POLL_S, ended_or_late, last_words, start
 from faults.outcome import Differs
 from faults.work import roll_out, train
-from imfvla.files import write_together
 from imfvla.reporting.media import Media
 from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.files import write_together
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_weights, save_weights
 from imfvla.training.logger import read_metrics
 
