@@ -120,6 +120,7 @@ def put_folder(part: Path, path: Path) -> None:
     A folder at `path` moves aside and is deleted afterwards, since on NFS a file that a process has open cannot be
     deleted. After a kill in between call `clear_folder`. Others must not do the same at once.
     """
+    clear_folder(path)
     for place, _, files in os.walk(part):
         for name in files:
             sync(Path(place, name))

@@ -29,7 +29,6 @@ from imfvla.storage.documents import parse_json, read_json
 from imfvla.storage.files import (
     PARTIAL,
     SCRATCH,
-    clear_folder,
     clear_write_errors,
     delete_leftovers,
     make_folder,
@@ -131,7 +130,6 @@ def save_weights(
     with clear_write_errors(directory):
         try:
             shutil.rmtree(temporary, ignore_errors=True)
-            clear_folder(directory)
             make_folder(directory.parent)
             temporary.mkdir()
             write_tensors(temporary / "policy.safetensors", tensors, {"format": WEIGHTS_FORMAT})
@@ -222,6 +220,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
             raise OSError(None, str(error)) from error
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
     finally:
+        with suppress(OSError):
+            scratch.rmdir()  # works where no file handle is left
         shutil.rmtree(scratch, ignore_errors=True)
 
 

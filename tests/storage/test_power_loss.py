@@ -10,13 +10,13 @@ from losing_disk import watch
 from synthetic import write_demonstrations, write_episode
 from synthetic_runs import episodes_of
 
-from imfvla import collection
 from imfvla.data import FrameStore
 from imfvla.episode import Decision
 from imfvla.errors import UserError
 from imfvla.recording import read_episode, write_mp4
 from imfvla.reporting.episodes import read_episodes
 from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
+from imfvla.sources import collection
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.mcap_writer import McapWriter
 from imfvla.storage.files import clear_folder, copy_file, write_json, write_text, write_together

@@ -20,7 +20,7 @@ from imfvla.sources.mcap import McapSource
 from imfvla.storage.files import write_together
 from imfvla.storage.run_directory import RunDirectory
 
-FILES, WRITERS = 40, 4
+FILES, WRITERS = 8, 4
 
 
 def publications(folder: Path, kills: int, rng: random.Random) -> str:
