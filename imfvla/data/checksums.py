@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from imfvla.storage.opening import ARRAY, open_to_read
+
 KEY = "checksums"  # in a store's meta.json
 META = "meta.json"
 BLOCK_BYTES = 16 * 2**20
@@ -24,9 +26,9 @@ _seen: dict[Path, tuple[Any, Sums]] = {}  # stores that this process has read, a
 
 
 def block_sums(path: Path) -> list[str]:
-    """CRC-32 of each block of a file, 8 hex digits. Raises OSError."""
+    """CRC-32 of each block of a file, 8 hex digits. Raises UserError for what is no file, and OSError."""
     found, buffer = [], memoryview(bytearray(CHUNK_BYTES))
-    with open(path, "rb", buffering=0) as stream:
+    with open_to_read(path, ARRAY) as stream:
         value = filled = 0
         while count := stream.readinto(buffer[: min(CHUNK_BYTES, BLOCK_BYTES - filled)]):
             value, filled = zlib.crc32(buffer[:count], value), filled + count

@@ -23,7 +23,8 @@ from imfvla.errors import UserError
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
 from imfvla.sources.validation import check_episode
 from imfvla.storage.documents import read_json
-from imfvla.storage.files import locked, write_remedy
+from imfvla.storage.files import clear_folder, locked, make_folder, put_folder, write_remedy
+from imfvla.storage.opening import ARRAY, checked
 
 FORMAT = 2
 IMAGES = "images.raw"
@@ -80,7 +81,7 @@ class FrameStore:
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
-            images = np.asarray(np.memmap(path / IMAGES, np.uint8, "r", shape=shape))
+            images = _mapped(path / IMAGES, np.uint8, shape)
             episodes, row, frame = [], 0, 0
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
@@ -122,6 +123,7 @@ class FrameStore:
             source.robot.camera(view)
         meta = meta_of(source, tuple(views), tuple(image_size))
         with locked(store_path):
+            clear_folder(store_path)
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
@@ -153,7 +155,7 @@ def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
 
 def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progress: Progress) -> None:
     """Writes a complete store beside `store_path` and moves it there."""
-    if store_path.exists() and not (store_path.is_dir() and set(os.listdir(store_path)) <= FILES):
+    if store_path.exists() and not (store_path.is_dir() and _names(store_path) <= FILES):
         raise UserError(
             f"{store_path} is the place of decoded frames, but is not a frame store: move it away, or choose another "
             "folder with demos.frames_directory."
@@ -161,7 +163,7 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
     part = store_path.with_name(f".{store_path.name}.part")
     needed = _num_frames(source, meta["views"]) * len(meta["views"]) * 3 * math.prod(meta["image_size"])
     try:
-        store_path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(store_path.parent)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         if (free := shutil.disk_usage(part).free) < needed:
@@ -171,8 +173,7 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
                 "number of views."
             )
         written = _write_arrays(source, part, meta, progress)
-        shutil.rmtree(store_path, ignore_errors=True)
-        part.rename(store_path)
+        put_folder(part, store_path)
         remember(store_path, written, ARRAYS)
     except OSError as error:
         raise UserError(
@@ -181,6 +182,11 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
         ) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _names(store_path: Path) -> set[str]:
+    """The files of a store, without those that NFS keeps while a process has them open."""
+    return {name for name in os.listdir(store_path) if not name.startswith(".nfs")}
 
 
 def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
@@ -227,8 +233,19 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _load(path: Path) -> np.ndarray:
-    """Memory-mapped: all processes share it, and a header that states more than the file holds is refused."""
-    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    """Memory-mapped: all processes share it. Raises ValueError where its file has another size than it states."""
+    array = np.load(checked(path, ARRAY), mmap_mode="r", allow_pickle=False)
+    if not isinstance(array, np.memmap) or path.stat().st_size != array.offset + array.nbytes:
+        raise ValueError(f"{path.name} has {path.stat().st_size} bytes, wanted another number")
+    return np.asarray(array)
+
+
+def _mapped(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
+    """The same for a file without a header."""
+    size, wanted = path.stat().st_size, math.prod(shape) * np.dtype(kind).itemsize
+    if size != wanted:
+        raise ValueError(f"{path.name} has {size} bytes, wanted {wanted}")
+    return np.asarray(np.memmap(checked(path, ARRAY), kind, "r", shape=shape))
 
 
 def _decoded(

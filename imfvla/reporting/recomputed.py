@@ -10,6 +10,7 @@ from typing import Any
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import REMEDY, read_episodes
 from imfvla.reporting.metrics import Row, summarise
+from imfvla.storage.opening import ROWS, open_to_read
 
 EPISODES = "episodes.jsonl"
 DIGEST = "episodes_digest"  # key of summary.json; evaluations from before it have none
@@ -18,19 +19,23 @@ OF_SOME_TASKS = ("success_of_goal",)  # metrics that not every evaluation has
 log = logging.getLogger(__name__)
 
 
-def recomputed(folder: Path, summary: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[Row, ...]]:
+def recomputed(
+    folder: Path, summary: Mapping[str, Any], *, home: Path | None = None
+) -> tuple[dict[str, Any], tuple[Row, ...]]:
     """A summary with the numbers of the episodes beside it, and these in the order of their seeds.
+
+    Files must lie in `home`, by default the folder itself.
 
     Raises UserError where they are missing, damaged or not those that the summary was made from, and where the summary
     contradicts its protocol.
     """
     _refuse_contradictions(folder, summary)
     first, last = summary["seeds"]
-    rows = read_episodes(folder / EPISODES, range(first, last + 1))
+    rows = read_episodes(folder / EPISODES, range(first, last + 1), home)
     metrics = summarise(rows)
     wrong = [key for key, value in metrics.items() if key in summary and not _equal(summary[key], value)]
     if DIGEST in summary:
-        if summary[DIGEST] != digest_of(folder / EPISODES):
+        if summary[DIGEST] != digest_of(folder / EPISODES, home):
             raise UserError(
                 f"{folder / EPISODES} was changed after its summary.json was written, which has another {DIGEST}: "
                 f"{REMEDY}."
@@ -51,9 +56,10 @@ def recomputed(folder: Path, summary: Mapping[str, Any]) -> tuple[dict[str, Any]
     return metrics | rest, rows
 
 
-def digest_of(path: Path) -> str:
-    """16 hex digits of a file's content."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+def digest_of(path: Path, home: Path | None = None) -> str:
+    """16 hex digits of the rows in a file."""
+    with open_to_read(path, ROWS, home=home) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:16]
 
 
 def _with_returns(folder: Path, recordings: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, Any]:

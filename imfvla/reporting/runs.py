@@ -147,7 +147,7 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
+    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True, home=run.path)
     missing = [key for key in DESCRIPTION if key not in summary]
     if missing:
         raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")
@@ -160,5 +160,5 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
     summary |= {"protocol": as_recorded(summary["protocol"])}
     refuse_changed_config(run, config, summary["checkpoint_step"])
     refuse_other_config(config, run.path, path, summary.get(DIGEST))
-    summary, episodes = recomputed(folder, summary)
+    summary, episodes = recomputed(folder, summary, home=run.path)
     return Evaluation(run.path, folder, summary, config, episodes)

@@ -1,6 +1,5 @@
 """Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -49,15 +48,12 @@ def evaluate(
         raise UserError(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
-    run.refuse_links_outside()
+    run.refuse_strangers()
     step = run.weights_step(options.checkpoint)
-    weights = run.policy_weights(step)
-    if not weights.exists():
-        raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
+    digest = run.weights_digest(step)
     refuse_changed_config(run, config, step)
     for path in sorted(run.path.glob("rollouts/*/summary.json")):
-        refuse_other_config(config, run.path, path, _config_digest(path))
+        refuse_other_config(config, run.path, path, _config_digest(path, run.path))
     config_digest = digest_of_config(config)
     count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
     summaries = []
@@ -114,10 +110,10 @@ def evaluate(
     return summaries
 
 
-def _config_digest(summary: Path) -> Any:
+def _config_digest(summary: Path, home: Path) -> Any:
     """Of the config that a finished evaluation was made with; None where its summary does not say it."""
     try:
-        return read_json(summary, "evaluate again", mapping=True).get(DIGEST)
+        return read_json(summary, "evaluate again", mapping=True, home=home).get(DIGEST)
     except UserError:  # an evaluation that is not asked for
         return None
 

@@ -3,7 +3,6 @@
 Shapes: W decisions, N decisions of training episodes, S state, Tp predicted steps, A action.
 """
 
-import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -49,7 +48,7 @@ def evaluate_offline(
     unseen = held_out_windows(windows)
     protocol = {
         "checkpoint_step": step,
-        "weights": hashlib.sha256(run.policy_weights(step).read_bytes()).hexdigest()[:16],
+        "weights": run.weights_digest(step),
         "nfe": list(options.nfe),
         "noise_seed": options.noise_seed,
         "noise_scale": options.noise_scale,

@@ -15,9 +15,18 @@ from imfvla.reporting.episodes import read_row
 from imfvla.reporting.metrics import Row
 from imfvla.reporting.recomputed import DIGEST as EPISODES_DIGEST
 from imfvla.reporting.recomputed import EPISODES, digest_of, recomputed
-from imfvla.storage.documents import parse_json, read_json
-from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
+from imfvla.storage.documents import parse_json, read_json, read_text
+from imfvla.storage.files import (
+    clear_write_errors,
+    delete_leftovers,
+    make_folder,
+    sync,
+    take_lock,
+    write_json,
+    write_text,
+)
 from imfvla.storage.fingerprint import code_version
+from imfvla.storage.opening import ROWS, open_to_append
 from imfvla.storage.trained_config import DIGEST
 
 log = logging.getLogger(__name__)
@@ -44,11 +53,13 @@ class RolloutLog:
 
     def __enter__(self) -> "RolloutLog":
         with clear_write_errors(self.path):
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path)
             self._lock = os.open(self.path, os.O_RDONLY)
         if not take_lock(self._lock, self.path):
             os.close(self._lock)
             raise UserError(f"{self.path} is in use by another evaluation: wait for it or stop it.")
+        for name in (PARTIAL, "episodes.jsonl", "summary.json"):
+            delete_leftovers(self.path / name)
         self._stream = None
         self.rows: list[dict[str, Any]] = []
         try:
@@ -68,17 +79,23 @@ class RolloutLog:
         )
 
     def append(self, row: Row) -> None:
-        """Adds a row and writes it to disk at once."""
+        """Adds a row and forces it to disk at once."""
         with clear_write_errors(self._partial):
             self._stream.write(dump_row(row))
             self._stream.flush()
+            os.fsync(self._stream.fileno())
         self.rows.append(dict(row))
 
     def finish(self, rows: Iterable[Row], summary: Mapping[str, Any]) -> None:
         """Writes `episodes.jsonl` and `summary.json`, each whole or not at all, the summary last."""
+        summary_path = self.path / "summary.json"
+        with clear_write_errors(self.path):
+            # Of other rows: a kill must not leave it beside the new ones.
+            summary_path.unlink(missing_ok=True)
+            sync(self.path)
         write_text(self.path / EPISODES, "".join(dump_row(row) for row in rows))
         summary = {**summary, DIGEST: self._config_digest, EPISODES_DIGEST: digest_of(self.path / EPISODES)}
-        write_json(self.path / "summary.json", summary)
+        write_json(summary_path, summary)
         self._stream.close()
         self._stream = None
         self._partial.unlink()
@@ -111,7 +128,7 @@ class RolloutLog:
     def _open_partial(self, header: Mapping[str, Any]) -> None:
         lines = []
         if self._partial.exists():
-            lines = self._partial.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+            lines = self._left()
         if lines and not lines[-1].endswith("\n"):  # cut off by a kill
             lines.pop()
         try:
@@ -127,7 +144,15 @@ class RolloutLog:
             log.warning("%s is damaged or of another %s: starting over.", self._partial, ", ".join(keys))
         text = json.dumps(header) + "\n" + "".join(dump_row(row) for row in self.rows)
         write_text(self._partial, text)
-        self._stream = open(self._partial, "a", encoding="utf-8")  # noqa: SIM115  closed by finish or on exit
+        with clear_write_errors(self._partial):
+            self._stream = open_to_append(self._partial)
+
+    def _left(self) -> list[str]:
+        """The lines of an interrupted evaluation."""
+        try:
+            return read_text(self._partial, ROWS).splitlines(keepends=True)
+        except UnicodeDecodeError:
+            return ["damaged\n"]
 
 
 def dump_row(row: Row) -> str:

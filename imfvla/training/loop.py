@@ -255,6 +255,7 @@ class Trainer:
         save_weights(directory, self.ema.policy, description, writes=self.processes.is_first)
 
     def _save_state(self, logger: MetricsLogger) -> None:
+        logger.sync()  # rows up to this step must outlive it
         self.saved_step = self.step
         details = {
             "step": self.step,

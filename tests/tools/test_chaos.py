@@ -39,6 +39,12 @@ def test_torchrun_brings_back_what_one_death_ended():
     assert chaos("torchrun").startswith("torchrun: 1 kills")
 
 
+def test_strangers_collisions_and_leftovers_do_no_harm():
+    printed = chaos("strangers", "publications", "no_locks", "nfs", "leftovers")
+    assert "none followed or waited for" in printed
+    assert "none failed, none were mixed" in printed
+
+
 def test_the_harness_tells_a_difference(tmp_path, capsys):
     path = list(sys.path)
     try:
