@@ -1,8 +1,10 @@
 """What an observation shows: which cameras, and how large their pictures may be."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-from imfvla.options import require
+from imfvla.options import build, part_of, require
 
 SMALLEST = (8, 8)  # (H, W) [px]
 LARGEST = (960, 1280)  # (H, W) [px]; the scene of our own tasks has a buffer of this size to draw into
@@ -26,3 +28,9 @@ class ViewOptions:
         require(
             fits, "observation.image_size", f"[height, width] with {limits} pixels", list(self.image_size)
         )
+
+
+def view_options(config: Mapping[str, Any]) -> ViewOptions:
+    """What a policy sees, of a composed config or a run's. Raises UserError where `observation` is wrong."""
+    seen = {name: part_of(config, f"observation.{name}") for name in ViewOptions.__slots__}
+    return build(ViewOptions, seen, "observation")

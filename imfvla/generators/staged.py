@@ -71,7 +71,7 @@ class StagedMeanFlow(AverageVelocity):
             )
 
     def _first_step(self, steps: int) -> int:
-        return round(self.average_from * steps)
+        return min(round(self.average_from * steps), steps - 1)  # the last one at least is of it
 
     def path_velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
         """Mean of v along the flow from z at t to r, without gradient: (B, H, A)."""

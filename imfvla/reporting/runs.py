@@ -8,8 +8,8 @@ from typing import Any
 from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import TableRow, read_mapping
-from imfvla.reporting.metrics import Row
 from imfvla.reporting.recomputed import recomputed
+from imfvla.reporting.rows import Row
 from imfvla.storage.documents import read_json
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key

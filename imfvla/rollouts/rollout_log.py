@@ -12,9 +12,9 @@ from typing import Any
 from imfvla.config.protocol import as_recorded
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import read_row
-from imfvla.reporting.metrics import Row
 from imfvla.reporting.recomputed import DIGEST as EPISODES_DIGEST
 from imfvla.reporting.recomputed import EPISODES, digest_of, recomputed
+from imfvla.reporting.rows import Row
 from imfvla.storage.documents import parse_json, read_json, read_text
 from imfvla.storage.files import (
     clear_write_errors,
