@@ -185,6 +185,9 @@ def test_weights_of_another_method_are_refused(calls, tmp_path):
     config = run.config()
     config["core"]["depth"] += 1
     (run.path / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(UserError, match=r"config\.yaml is not what .* trained with: core\.depth was 4, is 5"):
+        load_policy(run)
+    run.policy_weights().with_suffix(".json").unlink()  # weights that do not say what they are
     with pytest.raises(
         UserError, match=r"policy\.safetensors does not fit the configured policy: missing core"
     ):
