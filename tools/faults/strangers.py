@@ -5,6 +5,7 @@ import random
 import signal
 import socket
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_weights, save_weights
 from imfvla.training.logger import read_metrics
 
-MAX_S = 20.0  # of one command, most of it starting
+MAX_S = 120.0  # of one command, which takes a second on a machine with nothing else to do
 SECRET = b'{"of": "nobody else"}\n'
 HUGE = 8 * 10**9  # bytes, of zeros that take no space
 NAMES = (
@@ -123,8 +124,8 @@ def strangers(folder: Path, kills: int, rng: random.Random) -> str:
         kind(path, secret)
         os.chdir(here)
         work = rng.choice((partial(publish, place / "page"), read, resume, partial(roll_out, episodes=2)))
-        code = outcome(lambda _, work=work, run=run: work(run), place / "work")
         what = f"{kind.__name__} at {name}"
+        code = outcome(lambda _, work=work, run=run: work(run), place / "work", what)
         if code not in (0, 2):
             raise Differs(f"{what}: exit code {code}: {last_words(place / 'work')}")
         refused += code == 2
@@ -141,7 +142,7 @@ def names_of(folder: Path, number: int) -> list[str]:
     return sorted(["secret", *map(str, range(number + 1))])
 
 
-def outcome(work: partial, folder: Path) -> int:
+def outcome(work: Callable[[Path], None], folder: Path, what: str) -> int:
     """The exit code of work, which must end in time."""
     child, deadline = start(work, folder), time.monotonic() + MAX_S
     while ended_or_late(child, deadline):
@@ -149,5 +150,5 @@ def outcome(work: partial, folder: Path) -> int:
     if time.monotonic() >= deadline:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        raise Differs(f"no end after {MAX_S} s: {last_words(folder)}")
+        raise Differs(f"{what}: no end after {MAX_S} s: {last_words(folder)}")
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
