@@ -14,7 +14,7 @@ from tiny_policy import TinyPolicy
 
 from faults.killing import POLL_S, ended_or_late, last_words, start
 from faults.outcome import Differs
-from faults.work import roll_out, train
+from faults.work import OF_FAKES, play, train
 from imfvla.reporting.media import Media
 from imfvla.reporting.runs import evaluations
 from imfvla.storage.files import write_together
@@ -73,6 +73,12 @@ def resume(run: Path) -> None:
         train(run, steps=2)
 
 
+def evaluate(run: Path) -> None:
+    """What an evaluation does, which checks the size of the weights first, as the command does."""
+    load_weights(TinyPolicy(), RunDirectory(run).policy_weights(1), home=run)
+    play(run, episodes=2)
+
+
 def link(path: Path, secret: Path) -> None:
     path.symlink_to(secret)
 
@@ -110,7 +116,7 @@ def strangers(folder: Path, kills: int, rng: random.Random) -> str:
     tries = 4 * kills
     for number in range(tries):
         place = folder / str(number)
-        run = make_run(place / "run", "socket_ph32_exec16")
+        run = make_run(place / "run", "socket_ph32_exec16", **OF_FAKES)
         evaluation = write_evaluation(run, 1, number=3)
         save_weights(RunDirectory(run).weights_directory(1), TinyPolicy(), {})
         for name in ("best.mcap", "best.mp4"):
@@ -123,7 +129,7 @@ def strangers(folder: Path, kills: int, rng: random.Random) -> str:
         here = os.getcwd()
         kind(path, secret)
         os.chdir(here)
-        work = rng.choice((partial(publish, place / "page"), read, resume, partial(roll_out, episodes=2)))
+        work = rng.choice((partial(publish, place / "page"), read, resume, evaluate))
         what = f"{kind.__name__} at {name}"
         code = outcome(lambda _, work=work, run=run: work(run), place / "work", what)
         if code not in (0, 2):
