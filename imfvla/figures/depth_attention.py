@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from imfvla.errors import UserError
 from imfvla.figures.description import TWO_SUBLAYERS, sublayers_of
 from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
-from imfvla.storage.documents import MAX_JSON_BYTES, parse_json, read_text
+from imfvla.storage.documents import read_json
 
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
 COLUMNS = 2
@@ -30,10 +30,12 @@ def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> di
         return None
     remedy = f"delete it or repeat python tools/depth_attention.py {run}"
     try:
-        found = parse_json(read_text(path, MAX_JSON_BYTES))
+        found = read_json(path, remedy)
         _matrix(found["actions"])
         found["experiment"], found["checkpoint_step"]
-    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError) as error:
         raise UserError(f"{path} holds no depth weights: {error!r}; {remedy}.") from error
     return found | {"sublayers": sublayers_of(core) if core else TWO_SUBLAYERS}
 

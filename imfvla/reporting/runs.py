@@ -8,9 +8,12 @@ from typing import Any
 from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.recomputed import recomputed
+from imfvla.reporting.rows import Row
 from imfvla.storage.documents import read_json
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key
+from imfvla.storage.trained_config import DIGEST, refuse_changed_config, refuse_other_config
 
 REMEDY = ": evaluate again with overwrite=true"
 METRICS = (
@@ -25,12 +28,13 @@ DESCRIPTION = {
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """One finished evaluation of a run."""
+    """One finished evaluation of a run, every number of it from its episodes."""
 
     run: Path
     folder: Path
     summary: dict[str, Any]  # `summary.json`, every metric in it, its protocol completed
     config: dict[str, Any]  # `config.yaml` of the run
+    episodes: tuple[Row, ...]  # in the order of their seeds
 
     @property
     def experiment(self) -> str:
@@ -97,7 +101,9 @@ def key_of(run: Path, experiment: str) -> str:
 
 
 def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
-    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary.
+    """All finished evaluations of a run, by folder name.
+
+    Raises UserError for broken summaries and episodes, and where config.yaml is not what was trained and evaluated.
 
     Pass `config` to avoid reading it again.
     """
@@ -141,8 +147,8 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
-    missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
+    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True, home=run.path)
+    missing = [key for key in DESCRIPTION if key not in summary]
     if missing:
         raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")
     for key, kind in DESCRIPTION.items():
@@ -152,4 +158,7 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
     if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
         raise UserError(f"{path}: seeds must be [first, last], found {seeds!r}{REMEDY}.")
     summary |= {"protocol": as_recorded(summary["protocol"])}
-    return Evaluation(run.path, folder, summary, config)
+    refuse_changed_config(run, config, summary["checkpoint_step"])
+    refuse_other_config(config, run.path, path, summary.get(DIGEST))
+    summary, episodes = recomputed(folder, summary, home=run.path)
+    return Evaluation(run.path, folder, summary, config, episodes)

@@ -18,9 +18,10 @@ from imfvla.process.progress import Progress
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.sources.demonstrations import Settings, settings_of
-from imfvla.storage.documents import MAX_JSON_BYTES, parse_json, read_text
-from imfvla.storage.files import clear_write_errors, locked, write_json
+from imfvla.storage.documents import parse_json, read_text
+from imfvla.storage.files import clear_write_errors, delete_leftovers, locked, put_file, write_json
 from imfvla.storage.fingerprint import physical_cores
+from imfvla.storage.opening import JSON
 
 LOG_NAME = "collection.json"
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
@@ -172,7 +173,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     result = run_episode(env, expert, seed, [sink], kind="demonstration", config=settings.to_json())
     with clear_write_errors(path):
         if result.success:
-            trial.replace(path)
+            put_file(trial, path)
         else:
             trial.unlink()
     return seed, result.success
@@ -191,6 +192,7 @@ class _Log:
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._path = directory / LOG_NAME
+        delete_leftovers(self._path)
         self._remedy = f"choose another demos.directory, or move {directory} away to record it again"
         env, _ = _stage_for(settings)
         self._settings = json.loads(json.dumps(settings.to_json())) | {"model": env.model_digest()}
@@ -222,8 +224,10 @@ class _Log:
     def _read(self) -> tuple[dict[str, Any], set[int]]:
         """The settings and the seeds that failed."""
         try:
-            found = parse_json(read_text(self._path, MAX_JSON_BYTES))
+            found = parse_json(read_text(self._path, JSON))
             return LATER_SETTINGS | dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
+        except UserError:
+            raise
         except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise UserError(f"{self._path} is damaged ({error}); {self._remedy}.") from error
 
