@@ -6,9 +6,9 @@ from fakes import LIMIT, FakeEnvironment, KnownPolicy, known_actions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imfvla.actor import FAR, ChunkActor
-from imfvla.horizon import Horizon
-from imfvla.rollout import FAR_OUT_OF_RANGE, NON_FINITE, run_episode
+from imfvla.config.horizon import Horizon
+from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, run_episode
+from imfvla.rollouts.actor import FAR, ChunkActor
 
 horizons = st.integers(1, 5).flatmap(
     lambda obs: st.integers(1, 9).flatmap(

@@ -13,11 +13,11 @@ import pytest
 import synthetic_runs
 import yaml
 
+from imfvla.command.sweep import jobs_of_rows
 from imfvla.errors import UserError
-from imfvla.files import write_json
 from imfvla.reporting.mapping import read_mapping
-from imfvla.run_directory import DONE, RunDirectory
-from imfvla.sweep import jobs_of_rows
+from imfvla.storage.files import write_json
+from imfvla.storage.run_directory import DONE, RunDirectory
 
 PATH = Path(__file__).parents[1] / "tools" / "campaign.py"
 TOOL = types.SimpleNamespace(**runpy.run_path(str(PATH)))

@@ -3,10 +3,10 @@ import pytest
 import torch
 from any_robot import robot_of_size
 
-from imfvla.chunks import MIN_SCALE, ChunkFrame
+from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
+from imfvla.policy.chunks import MIN_SCALE, ChunkFrame
 from imfvla.robot import RobotSpec
-from imfvla.statistics import Statistics
 from imfvla.tasks.bimanual_robot import bimanual_robot
 
 STEPS, CHANNELS = 4, 16

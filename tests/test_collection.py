@@ -4,11 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imfvla import collection
-from imfvla.collection import collect, recorded_seeds
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.recording import read_episode
+from imfvla.sources import collection
+from imfvla.sources.collection import collect, recorded_seeds
 
 TASK = {"name": "transfer", "variant": "easy", "expert": {"modes": 2, "noise": 0.002, "hold": 18, "dwell": 0}}
 OBSERVATION = {"views": ["front", "r_wrist"], "image_size": [24, 32]}

@@ -6,8 +6,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imfvla.command_line import in_hydras_words, quoted, refuse_ignored
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.command.line import in_hydras_words, quoted, refuse_ignored
 from imfvla.errors import UserError
 
 ODD = ["ä b", "data (1)", "a=1,b=2", "it's", "x~", "a:b", "1", "1e3", "true", "c{d}", "[e]", "back\\slash\\"]

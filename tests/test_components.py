@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 import tiny_sweep
 
-from imfvla import components
-from imfvla.construction import allowed_class, construct
+from imfvla.config import components
+from imfvla.config.construction import allowed_class, construct
 from imfvla.environments import environment_of
 from imfvla.errors import UserError
-from imfvla.fingerprint import fingerprint, packages
 from imfvla.policy import build_policy
-from imfvla.run_directory import DONE, RunDirectory
 from imfvla.sources import EpisodeSource
 from imfvla.sources.opening import open_source
+from imfvla.storage.fingerprint import fingerprint, packages
+from imfvla.storage.run_directory import DONE, RunDirectory
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "tests" / "example_package"

@@ -1,6 +1,6 @@
 import pytest
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 
 

@@ -12,12 +12,12 @@ import yaml
 pytest.importorskip("pyarrow", reason="needs the extra lerobot")
 from outside import EEF_ACTION, EEF_STATE, ROBOT, episode, options, write_robomimic
 
-from imfvla import conversion
-from imfvla.command_line import in_hydras_words
-from imfvla.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.line import in_hydras_words
 from imfvla.convert import main
 from imfvla.errors import UserError
 from imfvla.recording import read_episode
+from imfvla.sources import conversion
 from imfvla.sources.lerobot import LeRobotWriter
 from imfvla.sources.lerobot import open_source as open_lerobot
 

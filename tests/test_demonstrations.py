@@ -2,11 +2,11 @@
 
 import pytest
 
-from imfvla.composition import compose
-from imfvla.demonstrations import settings_of
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.gymnasium_env.experts import make_expert
 from imfvla.modes.recordings import settings_of as settings_of_run
+from imfvla.sources.demonstrations import settings_of
 
 
 def settings(task: str, *overrides: str, camera_every: int = 4):

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from imfvla.depth_attention import ACTIONS, CONTEXT, DepthWeights, record_depth_weights
 from imfvla.errors import UserError
 from imfvla.nn.residual import AttentionResidual, BlockAttentionResidual, StandardResidual
 from imfvla.nn.transformer import TransformerCore
+from imfvla.rollouts.depth_attention import ACTIONS, CONTEXT, DepthWeights, record_depth_weights
 
 DEPTH = 3
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from imfvla.gl import PACKAGES, install_command
+from imfvla.process.gl import PACKAGES, install_command
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 

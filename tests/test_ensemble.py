@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from fakes import FakeEnvironment, KnownPolicy, known_actions
 
-from imfvla.actor import ChunkActor
-from imfvla.ensemble import TemporalEnsemble
+from imfvla.config.horizon import Horizon
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.ensemble import TemporalEnsemble
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.01, 1.0])

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from imfvla.entry import entry_point, output_directory
+from imfvla.command.entry import entry_point, output_directory
 from imfvla.errors import UserError
 
 

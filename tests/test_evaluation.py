@@ -9,14 +9,14 @@ import pytest
 import yaml
 from fakes import FakeEnvironment, KnownPolicy, build_fakes
 
-from imfvla import workbench
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
-from imfvla.evaluation import best_median_worst, evaluate
-from imfvla.protocol import EvaluationOptions
 from imfvla.reporting.metrics import TIMING
-from imfvla.rollout_log import PARTIAL
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts import workbench
+from imfvla.rollouts.evaluation import best_median_worst, evaluate
+from imfvla.rollouts.rollout_log import PARTIAL
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
 
 NAME = "seeds100000-100005_nfe1"
@@ -242,7 +242,7 @@ def test_a_config_of_something_else_is_named(run):
 
 
 def test_two_evaluations_do_not_write_into_one_folder(run):
-    from imfvla.rollout_log import RolloutLog
+    from imfvla.rollouts.rollout_log import RolloutLog
 
     with RolloutLog(run.rollouts(NAME), {}), pytest.raises(UserError, match="in use by another evaluation"):
         roll(run)

@@ -6,13 +6,13 @@ import pytest
 import torch
 import yaml
 
-from imfvla import experiment
-from imfvla.composition import compose
+from imfvla.command import experiment
+from imfvla.command.composition import compose
+from imfvla.command.experiment import run_experiment
 from imfvla.errors import UserError
-from imfvla.experiment import run_experiment
 from imfvla.robot_of import with_robot
-from imfvla.run_directory import DONE, FAILED, RunDirectory
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.run_directory import DONE, FAILED, RunDirectory
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.logger import read_metrics
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.files import copy_file, locked, write_atomically, write_json, write_text, write_together
-from imfvla.rollout_log import RolloutLog
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.rollout_log import RolloutLog
+from imfvla.storage.files import copy_file, locked, write_atomically, write_json, write_text, write_together
+from imfvla.storage.run_directory import RunDirectory
 
 
 def test_replaces_whole(tmp_path):

@@ -1,7 +1,7 @@
 import json
 import os
 
-from imfvla.fingerprint import code_version, fingerprint, physical_cores
+from imfvla.storage.fingerprint import code_version, fingerprint, physical_cores
 
 
 def test_is_json_and_complete():

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from imfvla import gl, gl_probe
 from imfvla.errors import UserError
-from imfvla.gl import Answer
+from imfvla.process import gl, gl_probe
+from imfvla.process.gl import Answer
 
 ROOT = Path(__file__).resolve().parent.parent
 DRAWS, MISSING = Answer(devices=1), Answer(problem="its library cannot be loaded")

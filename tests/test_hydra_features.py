@@ -2,8 +2,8 @@
 
 import pytest
 
-from imfvla.composition import CONFIG_DIRECTORY
-from imfvla.entry import entry_point, output_directory
+from imfvla.command.composition import CONFIG_DIRECTORY
+from imfvla.command.entry import entry_point, output_directory
 from imfvla.train import usage
 
 

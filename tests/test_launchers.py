@@ -3,7 +3,7 @@
 import pytest
 import tiny_sweep
 
-from imfvla.run_directory import DONE, RunDirectory
+from imfvla.storage.run_directory import DONE, RunDirectory
 
 LAUNCHERS = {
     "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ["hydra.launcher.timeout_min=5"]),

@@ -8,15 +8,15 @@ import pytest
 from any_robot import MemorySource, robot_of_size
 from test_any_robot import configured
 
-from imfvla.completion import is_complete
-from imfvla.composition import compose
+from imfvla.command.completion import is_complete
+from imfvla.command.composition import compose
+from imfvla.command.experiment import run_experiment
+from imfvla.command.publication import publish
 from imfvla.errors import UserError
-from imfvla.experiment import run_experiment
-from imfvla.offline import _errors, _hold, _nearest
-from imfvla.publication import publish
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.offline import HOLD, NEAREST, by_channel, by_step, offline_table, read_offline
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.offline import _errors, _hold, _nearest
+from imfvla.storage.run_directory import RunDirectory
 
 ROBOT = robot_of_size(7, 7)
 
@@ -45,7 +45,9 @@ def run(tmp_path, monkeypatch) -> RunDirectory:
     """A finished run on four episodes of which one is held out; it is done again where a test runs it again."""
     source = MemorySource(ROBOT)
     monkeypatch.setattr("imfvla.sources.mcap.open_source", lambda options, *, where: source)
-    monkeypatch.setattr("imfvla.experiment.select_gl_backend", lambda: pytest.fail("nothing is rendered"))
+    monkeypatch.setattr(
+        "imfvla.command.experiment.select_gl_backend", lambda: pytest.fail("nothing is rendered")
+    )
     run = RunDirectory(tmp_path / "runs" / "none" / "default")
     run_experiment(settings(tmp_path), run)
     return run

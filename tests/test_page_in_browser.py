@@ -8,8 +8,8 @@ import pytest
 from chromium import BINARY, Page, chromium
 from synthetic_runs import answer_row
 
-from imfvla.composition import compose
-from imfvla.publication import publish
+from imfvla.command.composition import compose
+from imfvla.command.publication import publish
 from imfvla.recording.video import write_mp4
 from imfvla.reporting.mapping import read_mapping
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
-from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS, tokenize
 from imfvla.policy import build_policy, hold_last
-from imfvla.types import Batch, Observation
+from imfvla.types import MAX_WORDS, NUM_WORD_IDS, Batch, Observation, tokenize
 
 STATISTICS = SimpleNamespace(
     state_min=np.full(16, -2.0, np.float32),

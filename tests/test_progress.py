@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from imfvla.progress import Progress
+from imfvla.process.progress import Progress
 
 
 class Terminal(io.StringIO):

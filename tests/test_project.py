@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from imfvla.command_line import in_hydras_words
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.command.line import in_hydras_words
 from imfvla.policy import build_policy
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,12 +11,12 @@ from unittest import mock
 import pytest
 from synthetic_runs import answer_row, make_run, write_evaluation
 
-from imfvla import publication
-from imfvla.composition import compose
+from imfvla.command import publication
+from imfvla.command.composition import compose
+from imfvla.command.publication import publish
 from imfvla.errors import UserError
-from imfvla.files import write_together
-from imfvla.publication import publish
 from imfvla.reporting.mapping import PATH, read_mapping
+from imfvla.storage.files import write_together
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}

@@ -2,10 +2,10 @@
 
 import pytest
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.command.rehearsal import rehearse
 from imfvla.errors import UserError
 from imfvla.generators.staged import StagedMeanFlow
-from imfvla.rehearsal import rehearse
 
 SMALL = ["core.width=16", "core.depth=1", "core.heads=2", "observation.views=[front]", "training.steps=10"]
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from fakes import ROBOT, FakeEnvironment, known_actions
 
+from imfvla.environments.rollout import NON_FINITE, SIMULATION_ENDED, ActionError, run_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.recording import McapSink, read_episode
-from imfvla.rollout import NON_FINITE, SIMULATION_ENDED, ActionError, run_episode
 
 
 class ScriptedActor:

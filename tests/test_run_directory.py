@@ -1,7 +1,7 @@
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.run_directory import DONE, RunDirectory, config_digest, differences
+from imfvla.storage.run_directory import DONE, RunDirectory, config_digest, differences
 
 CONFIG = {
     "name": "a",

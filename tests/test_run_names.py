@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from imfvla.run_names import MAX_KEY, run_key, run_name
+from imfvla.storage.run_names import MAX_KEY, run_key, run_name
 
 ROOT = Path(__file__).resolve().parent.parent
 WORDS = st.text(st.sampled_from("abz09_./@:{}~+-=,[] '"), max_size=12)

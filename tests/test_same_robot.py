@@ -7,7 +7,7 @@ from any_robot import robot_of_size
 
 from imfvla.errors import UserError
 from imfvla.robot import Camera
-from imfvla.same_robot import refuse_other_data, refuse_other_robot
+from imfvla.sources.same_robot import refuse_other_data, refuse_other_robot
 
 ROBOT = robot_of_size(8, 9, num_cameras=2)
 VIEWS = ("camera_0", "camera_1")

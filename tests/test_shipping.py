@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 from imfvla.errors import UserError
-from imfvla.files import write_json
 from imfvla.reporting.metrics import summarise
-from imfvla.run_directory import DONE, RUNNING, RunDirectory
-from imfvla.shipping import command_of, ship
+from imfvla.reporting.shipping import command_of, ship
+from imfvla.storage.files import write_json
+from imfvla.storage.run_directory import DONE, RUNNING, RunDirectory
 
 EPISODE = {
     "total_reward": 900.0,

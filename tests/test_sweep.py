@@ -8,13 +8,13 @@ from unittest import mock
 import pytest
 import tiny_sweep
 
-from imfvla.completion import is_complete
-from imfvla.composition import CONFIG_DIRECTORY
+from imfvla.command.completion import is_complete
+from imfvla.command.composition import CONFIG_DIRECTORY
+from imfvla.command.sweep import Planned, _Sweep, jobs_of_rows, waves
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import untimed
-from imfvla.run_directory import DONE, LAST, RunDirectory
-from imfvla.run_names import run_key, run_name
-from imfvla.sweep import Planned, _Sweep, jobs_of_rows, waves
+from imfvla.storage.run_directory import DONE, LAST, RunDirectory
+from imfvla.storage.run_names import run_key, run_name
 
 MAPPING = read_mapping()
 FILES = sorted(path.stem for path in (CONFIG_DIRECTORY / "sweep").glob("*.yaml"))
@@ -24,7 +24,7 @@ JOBS = ["-m", "seed=0,1", "core=attnres,standard", *tiny_sweep.OVERRIDES]
 @cache
 def planned_by(name: str) -> list[Planned]:
     """The jobs of a file of conf/sweep, which are not run."""
-    with mock.patch("imfvla.sweep._Sweep.run", return_value=[]) as run:
+    with mock.patch("imfvla.command.sweep._Sweep.run", return_value=[]) as run:
         tiny_sweep.main([f"+sweep={name}"])
     return run.call_args.args[0]
 

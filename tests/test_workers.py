@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.workers import worker_pool
+from imfvla.process.workers import worker_pool
 
 
 def threads_and_square(number: int) -> tuple[str | None, int]:
@@ -90,7 +90,7 @@ def test_whatever_a_worker_raises_arrives(monkeypatch):
 
 def test_a_script_needs_no_guard(tmp_path):
     lines = (
-        "from imfvla.workers import worker_pool",
+        "from imfvla.process.workers import worker_pool",
         "with worker_pool(1) as do:",
         "    print(*do(abs, [(-3,)]))",
     )
@@ -121,7 +121,7 @@ def test_the_call_of_a_worker_that_is_lost_is_made_again_in_a_fresh_one(tmp_path
 
 def test_workers_end_with_the_process_that_started_them(tmp_path):
     script = (
-        "import os, signal, time; from imfvla.workers import worker_pool\n"
+        "import os, signal, time; from imfvla.process.workers import worker_pool\n"
         "if __name__ == '__main__':\n"
         "    with worker_pool(1) as run_all:\n"
         "        print(*run_all(os.getpid, [()]), flush=True)\n"

@@ -78,7 +78,7 @@ def check_python() -> Finding:
 
 def check_machine() -> Finding:
     """CPU model, the flags that matter for speed, cores and memory."""
-    from imfvla.fingerprint import machine
+    from imfvla.storage.fingerprint import machine
 
     found = machine()
     flags = " ".join(found["cpu_flags"]) or "no fast vector flags"
@@ -92,7 +92,7 @@ def check_threads() -> Finding:
     """How many threads torch would use; more threads than cores make small matrices far slower."""
     import torch
 
-    from imfvla.fingerprint import physical_cores
+    from imfvla.storage.fingerprint import physical_cores
 
     cores = physical_cores()
     setting = os.environ.get("OMP_NUM_THREADS", "unset")

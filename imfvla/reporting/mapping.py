@@ -8,13 +8,13 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from imfvla.assets import folder
+from imfvla.config.assets import folder
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of, require, suggestion
 from imfvla.reporting.mapping_file import entries, load, named, place_of, plain
 from imfvla.reporting.paper import PaperComparison, PaperRow, paper_comparisons, paper_numbers, paper_rows
-from imfvla.run_directory import LAST, step_of
-from imfvla.run_names import run_key, run_name
+from imfvla.storage.run_directory import LAST, step_of
+from imfvla.storage.run_names import run_key, run_name
 
 PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")

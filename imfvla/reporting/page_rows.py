@@ -8,7 +8,7 @@ from pathlib import Path
 from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.media import Media
 from imfvla.reporting.results import Result
-from imfvla.run_directory import flatten
+from imfvla.storage.run_directory import flatten
 
 
 def rollouts_of(result: Result, media: Media) -> str:

@@ -5,8 +5,8 @@ import torch
 from closed_forms import CHANNELS, MEAN, STD, STEPS, Context, GaussianFlow, columns, draw
 from torch import nn
 
-from imfvla.composition import compose
-from imfvla.construction import construct
+from imfvla.command.composition import compose
+from imfvla.config.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.base import UniformTimes
 from imfvla.generators.staged import StagedMeanFlow
