@@ -1,34 +1,25 @@
-"""What the files of an evaluation hold: the types and limits of `summary.json` and of the lines of `episodes.jsonl`.
+"""What the files of an evaluation hold: types and limits of `summary.json` and of the lines of `episodes.jsonl`.
 
 Keys that are not listed may be there too, with plain values: another version of imfvla may have written them.
 """
 
-from pathlib import PurePath
+from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
-from imfvla.options import Limit, above, at_most, within
-from imfvla.protocol import MAX_EPISODES, MAX_SEED
+from imfvla.config.protocol import MAX_EPISODES
+from imfvla.options import above, at_most, of_length, within
+from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Name, Seed, Step
 
 MOST_STEPS = 10**7  # control steps of an episode
-MOST_STAGES = 1000
+MOST_STAGES = 100
 MOST_DECISIONS = 100_000  # of an episode
-LARGEST = 1e12  # of a reward or a time: their sums and squares are finite
-MAX_NAME = 200  # characters
-NAME = Limit(
-    f"a text of 1 to {MAX_NAME} printable characters",
-    lambda text: len(text) <= MAX_NAME and text.isprintable() and bool(text),
-)
-FILE_NAME = Limit("the name of a file, without a directory", lambda text: PurePath(text).name == text != "..")
+MOST_NFE = 10**6
 
-Name = Annotated[str, NAME]
-FileName = Annotated[str, NAME, FILE_NAME]
-Seed = Annotated[int, within(0, MAX_SEED)]
 Count = Annotated[int, within(0, MAX_EPISODES)]
+Nfe = Annotated[int, within(1, MOST_NFE)]
 Amount = Annotated[float, within(-LARGEST, LARGEST)]
-Duration = Annotated[float, within(0, LARGEST)]
 Positive = Annotated[float, above(0), within(0, LARGEST)]
 Share = Annotated[float, within(0, 1)]
-Step = Annotated[int, within(1, 10**9)]  # of a training
 
 
 class Timing(TypedDict):
@@ -51,3 +42,52 @@ class Row(TypedDict):
     failure: Name | None
     goal: NotRequired[Name]
     timing: Timing
+
+
+# One of its keys is a keyword of Python.
+Recording = TypedDict("Recording", {"seed": Seed, "return": Amount, "file": FileName})
+
+
+class ProtocolRecord(TypedDict):
+    """What the rows of an evaluation depend on, besides the code."""
+
+    task: Name
+    variant: Name
+    checkpoint_step: Step
+    weights: Name
+    nfe: Nfe
+    noise_seed: Seed
+    noise_scale: Share
+    first_seed: Seed
+    episodes: Count
+    max_steps: Annotated[int, within(1, MOST_STEPS)] | None
+    device: Name
+
+
+class Summary(TypedDict):
+    """`summary.json`."""
+
+    episodes: Annotated[int, within(1, MAX_EPISODES)]
+    avg_return: Amount
+    median_return: Amount
+    mean_max_reward: Amount
+    max_return: Amount
+    nonzero_episodes: Count
+    success_episodes: Count
+    inference_fps: Positive | None
+    control_fps: Duration | None
+    inference_ms_mean: Positive | None
+    inference_ms_median: Positive | None
+    inference_ms_p95: Positive | None
+    success_interval: Annotated[list[Share], of_length(2)]
+    success_of_goal: NotRequired[Mapping[str, Annotated[list[Count], of_length(2)]]]
+    failures: Annotated[Mapping[str, Count], at_most(1000)]
+    name: FileName
+    experiment: Name
+    nfe: Nfe
+    checkpoint_step: Step
+    stages: NotRequired[Annotated[list[Label], at_most(MOST_STAGES)]]
+    seeds: Annotated[list[Seed], of_length(2)]
+    protocol: ProtocolRecord
+    recordings: NotRequired[Annotated[Mapping[str, Recording], at_most(100)]]
+    fingerprint: Fingerprint

@@ -7,20 +7,21 @@ from typing import Any
 
 from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
+from imfvla.options import require
 from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.records import Summary
 from imfvla.storage.documents import read_json
+from imfvla.storage.records import as_record
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key
 
-REMEDY = ": evaluate again with overwrite=true"
+REMEDY = "evaluate again with overwrite=true"
+# Of a summary, in the order of `table_row.json`.
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
     "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
     "inference_ms_p95", "success_interval", "failures",
 )  # fmt: skip
-DESCRIPTION = {
-    "experiment": str, "nfe": int, "checkpoint_step": int, "seeds": list, "protocol": dict, "fingerprint": dict,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Evaluation:
 
     run: Path
     folder: Path
-    summary: dict[str, Any]  # `summary.json`, every metric in it, its protocol completed
+    summary: Summary  # `summary.json`, every metric in it, its protocol completed
     config: dict[str, Any]  # `config.yaml` of the run
 
     @property
@@ -140,16 +141,21 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
-    path = folder / "summary.json"
-    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
-    missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
-    if missing:
-        raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")
-    for key, kind in DESCRIPTION.items():
-        if not isinstance(summary[key], kind):
-            raise UserError(f"{path}: {key} must be of type {kind.__name__}, found {summary[key]!r}{REMEDY}.")
-    seeds = summary["seeds"]
-    if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
-        raise UserError(f"{path}: seeds must be [first, last], found {seeds!r}{REMEDY}.")
-    summary |= {"protocol": as_recorded(summary["protocol"])}
-    return Evaluation(run.path, folder, summary, config)
+    return Evaluation(run.path, folder, read_summary(folder / "summary.json"), config)
+
+
+def read_summary(path: Path) -> Summary:
+    """The summary of an evaluation, its protocol completed. Raises UserError for anything else."""
+    found = read_json(path, REMEDY, mapping=True)
+    if isinstance(protocol := found.get("protocol"), dict):
+        found |= {"protocol": as_recorded(protocol)}
+    summary = as_record(found, Summary, str(path), REMEDY)
+    first, last = summary["seeds"]
+    wanted = [first, first + summary["episodes"] - 1]
+    require(
+        summary["seeds"] == wanted,
+        f"{path}: seeds",
+        f"{wanted}, as of {summary['episodes']} episodes",
+        [first, last],
+    )
+    return summary

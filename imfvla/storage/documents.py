@@ -13,12 +13,18 @@ from imfvla.errors import UserError, unreadable
 MAX_JSON_BYTES = 64 * 2**20
 MAX_YAML_DEPTH = 64
 MAX_YAML_BYTES = 256 * 2**10  # read a hundred times more slowly than JSON; a config has some 4 kB
+MAX_YAML_VALUES = 20_000  # keys, values, lists and mappings; each takes some 0.1 ms
 
 
 class ChosenLoader(yaml.SafeLoader):
-    """Safe, and without aliases, nine lines of which unfold to billions of values."""
+    """Safe, bounded, and without aliases, nine lines of which unfold to billions of values."""
+
+    num_values = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self.num_values += 1
+        if self.num_values > MAX_YAML_VALUES:
+            raise yaml.YAMLError(f"it has more than {MAX_YAML_VALUES} keys and values")
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError(f"line {self.peek_event().start_mark.line + 1} has an alias, wanted values")
         return super().compose_node(parent, index)

@@ -22,10 +22,12 @@ import yaml
 from imfvla.config.protocol import CHECKPOINT, LAST
 from imfvla.errors import UserError
 from imfvla.options import require
-from imfvla.storage.documents import read_json, read_yaml
+from imfvla.storage.documents import read_yaml
 from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
+from imfvla.storage.records import STATES, RunConfig, Status, as_record, read_record
 
-RUNNING, DONE, FAILED = "running", "done", "failed"
+RUNNING, DONE, FAILED = STATES
+
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
     "evaluation",
@@ -119,9 +121,7 @@ class RunDirectory:
             config = read_yaml(path)
         except FileNotFoundError:
             raise UserError(f"{self.path} is not a run directory: it has no {path.name}.") from None
-        if not isinstance(config, dict):
-            raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
-        return config
+        return as_record(config, RunConfig, str(path), "restore it from a copy")
 
     def refuse_links_outside(self) -> None:
         """Raises UserError where a link would redirect writes to somewhere else."""
@@ -156,7 +156,7 @@ class RunDirectory:
         path = self.path / "status.json"
         if not path.exists():
             return {}
-        return read_json(path, "delete it and run again", mapping=True)
+        return read_record(path, Status, "delete it and run again")
 
     def write_status(self, state: str, **details: Any) -> None:
         """state: running, done or failed; `details` (step, error, ...) replace those of before."""
