@@ -85,6 +85,11 @@ def at_most(entries: int) -> Limit:
     return Limit(f"of length {entries} at most", lambda value: len(value) <= entries)
 
 
+def within_length(fewest: int, most: int) -> Limit:
+    """Lists of so many entries."""
+    return Limit(f"a list of {fewest} to {most} entries", lambda value: fewest <= len(value) <= most)
+
+
 def of_length(entries: int) -> Limit:
     """Lists of so many entries."""
     return Limit(f"a list of {entries} entries", lambda value: len(value) == entries)

@@ -18,6 +18,7 @@ from imfvla.options import build, require
 MAX_CHANNELS = 1000
 MAX_CAMERAS = 64
 MAX_CONTROL_HZ = 10_000.0
+MAX_SIDE = 16_384  # of a picture [px]
 UNIT = re.compile(r"(.*\S) \[([^\[\]]*)\]")  # "left/joint_1 [rad]"
 
 
@@ -101,9 +102,9 @@ class RobotSpec:
         require(len(set(names)) == len(names), "robot.cameras", "names that all differ", names)
         for camera in self.cameras:
             require(
-                min(camera.height, camera.width) > 0,
+                0 < min(camera.height, camera.width) <= max(camera.height, camera.width) <= MAX_SIDE,
                 f"robot.cameras.{camera.name}",
-                "a positive size",
+                f"of 1 to {MAX_SIDE} pixels a side",
                 camera,
             )
 

@@ -16,6 +16,7 @@ from imfvla.policy import Policy, build_policy
 from imfvla.policy.chunks import FRAMES
 from imfvla.robot_of import has_environment, view_options
 from imfvla.rollouts.evaluation import require_device
+from imfvla.storage.records import Name
 from imfvla.storage.run_directory import step_of
 from imfvla.training.loop import choose_device
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -26,7 +27,7 @@ from imfvla.types import MAX_WORDS, Batch, Observation
 class Scalars:
     """The keys of train.yaml outside of groups."""
 
-    name: str
+    name: Name
     seed: Annotated[int, within(0, MAX_SEED)]
     action_frame: Annotated[str, one_of(*FRAMES)]
 

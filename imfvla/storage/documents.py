@@ -11,6 +11,7 @@ import yaml
 from imfvla.errors import UserError, unreadable
 
 MAX_JSON_BYTES = 64 * 2**20
+MAX_LINES = 1_000_000  # of JSON
 MAX_YAML_DEPTH = 64
 MAX_YAML_BYTES = 256 * 2**10  # read a hundred times more slowly than JSON; a config has some 4 kB
 MAX_YAML_VALUES = 20_000  # keys, values, lists and mappings; each takes some 0.1 ms
@@ -82,6 +83,9 @@ def parse_json(text: str | bytes) -> Any:
 def read_lines(path: Path, remedy: str) -> list[str]:
     """The lines of a text, ends kept. Raises UserError, ending with `remedy`, where it cannot be read."""
     try:
-        return read_text(path, MAX_JSON_BYTES).splitlines(keepends=True)
+        text = read_text(path, MAX_JSON_BYTES)
+        if (found := text.count("\n")) > MAX_LINES:
+            raise ValueError(f"it has {found} lines, wanted at most {MAX_LINES}")
+        return text.splitlines(keepends=True)
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}; {remedy}.") from error

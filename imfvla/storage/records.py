@@ -103,9 +103,10 @@ class WeightsDescription(TypedDict):
 
 
 class MetricsRow(TypedDict):
-    """The key of a line of `metrics.jsonl` that each line has; the others are metrics."""
+    """A line of `metrics.jsonl`: what each line has, beside metrics as numbers."""
 
     step: Step
+    loss: NotRequired[Number | None]
 
 
 Metrics = Annotated[Mapping[str, Number | None], at_most(1000)]
