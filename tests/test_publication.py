@@ -163,7 +163,7 @@ def test_evaluations_of_no_row_have_a_table_of_their_own(runs, tmp_path, method,
 
 def test_the_command_needs_neither_torch_nor_a_simulator(runs, tmp_path):
     check = (
-        "import sys; from imfvla import publication; from imfvla.report import main; "
+        "import sys; from imfvla.command import publication; from imfvla.report import main; "
         "publication.render = lambda figure: {'.svg': b'', '.png': b''}; main(sys.argv[1:]); "
         "assert not {'torch', 'mujoco', 'dm_control'} & set(sys.modules)"
     )

@@ -35,8 +35,8 @@ from importlib import metadata
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # works before the package is installed, and then says what is missing
 
-from imfvla import gl  # noqa: E402
 from imfvla.errors import UserError  # noqa: E402
+from imfvla.process import gl  # noqa: E402
 
 MIN_PYTHON = (3, 11)
 MIN_FREE_GB = 5.0  # demonstrations, frame store and one run of a task

@@ -11,7 +11,7 @@ import pytest
 
 from imfvla.process.gl import PACKAGES, install_command
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
 
 @pytest.fixture

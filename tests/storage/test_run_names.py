@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from imfvla.storage.run_names import MAX_KEY, run_key, run_name
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 WORDS = st.text(st.sampled_from("abz09_./@:{}~+-=,[] '"), max_size=12)
 LONG = st.integers(0, 150).map(lambda length: f"core.text={'x' * length}")
 OVERRIDES = st.lists(st.one_of(st.builds("{}={}".format, WORDS, WORDS), WORDS, LONG), max_size=5)

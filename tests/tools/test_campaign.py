@@ -19,7 +19,7 @@ from imfvla.reporting.mapping import read_mapping
 from imfvla.storage.files import write_json
 from imfvla.storage.run_directory import DONE, RunDirectory
 
-PATH = Path(__file__).parents[1] / "tools" / "campaign.py"
+PATH = Path(__file__).parents[2] / "tools" / "campaign.py"
 TOOL = types.SimpleNamespace(**runpy.run_path(str(PATH)))
 STEPS = 6000
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from test_hostile_files import load_tool
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def chaos(*what: str) -> str:

@@ -19,7 +19,7 @@ from imfvla.sources.opening import open_source
 from imfvla.storage.fingerprint import fingerprint, packages
 from imfvla.storage.run_directory import DONE, RunDirectory
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "tests" / "example_package"
 MODULE = """
 import os

@@ -11,7 +11,7 @@ from imfvla.errors import UserError
 from imfvla.process import gl, gl_probe
 from imfvla.process.gl import Answer
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DRAWS, MISSING = Answer(devices=1), Answer(problem="its library cannot be loaded")
 
 
