@@ -12,6 +12,7 @@ from imfvla.figures.depth_attention import depth_attention, read_depth_attention
 from imfvla.figures.evaluations import success_by_evaluations
 from imfvla.figures.failures import failed_stages
 from imfvla.figures.learning import learning_curves
+from imfvla.figures.methods import success_by_cost
 from imfvla.figures.overview import method_overview
 from imfvla.figures.reward_latency import reward_latency
 from imfvla.figures.style import render
@@ -33,6 +34,7 @@ MAX_HEAT_MAPS = 4
 OF_TABLE = {  # by `figure` of a table: what draws its rows, and what that shows
     "reward_latency": (reward_latency, "average reward against the time of a chunk."),
     "ablations": (ablations, "ablations and rivals."),
+    "success_by_cost": (success_by_cost, "success against the network calls and the time of a chunk."),
 }
 
 
@@ -140,9 +142,9 @@ def _figures(
         if table.figure is not None:
             draw, shows = OF_TABLE[table.figure]
             number = len(drawn) + 1
-            task = mapping.task(table.task).title
+            title = mapping.task(table.task).title if table.printed else table.title
             rows = [result for result in results if result.row.table == table.name]
-            caption = f"Figure {number}. {task[:1].upper()}{task[1:]}: {shows} Bars are 95% intervals."
+            caption = f"Figure {number}. {title[:1].upper()}{title[1:]}: {shows} Bars are 95% intervals."
             drawn[f"figure{number}_{table.figure}"] = (draw(rows), caption)
     drawn |= {
         "evaluations": (

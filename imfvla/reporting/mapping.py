@@ -20,7 +20,7 @@ PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
 ROWS, COMPARISONS = "rows", "comparisons"
-FIGURES = ("reward_latency", "ablations")  # of a table's rows
+FIGURES = ("reward_latency", "ablations", "success_by_cost")  # of a table's rows
 SECTIONS = ("evaluation", "tasks", "tables")
 PRINTED = Limit("the number of a table in experiments/paper", lambda number: number in paper_numbers())
 
