@@ -18,7 +18,7 @@ from mcap.records import Message, Statistics
 
 from imfvla.errors import UserError
 from imfvla.recording import Episode, read_episode
-from imfvla.recording.mcap_file import clear_read_errors, records
+from imfvla.recording.mcap_file import clear_read_errors, misplaced_end, records
 
 
 def check(path: Path) -> tuple[Episode, list[str]]:
@@ -29,7 +29,10 @@ def check(path: Path) -> tuple[Episode, list[str]]:
     statistics: Statistics | None = None
     last = 0
     with clear_read_errors(path):
-        for record in records(path.read_bytes()):
+        data = path.read_bytes()
+        if misplaced := misplaced_end(data):
+            problems.append(misplaced)
+        for record in records(data):
             if isinstance(record, Message):
                 counts[record.channel_id] += 1
                 if record.log_time < last:

@@ -31,6 +31,7 @@ from imfvla.figures.learning import learning_curves
 from imfvla.figures.style import style
 from imfvla.figures.two_runs import two_runs
 from imfvla.reporting.answers import Sources
+from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import by_channel, by_step, offline_table, read_offline
@@ -153,6 +154,7 @@ def _report(run: RunDirectory, *, is_drawn: bool) -> None:
     page([table.shown], [], results, Media(run.path.parent, is_copied=False))
     config = sources.configs[run.path]
     weights = read_depth_attention(run.path, config.get("core"))
+    learning_curve(run.path)
     if is_drawn:
         for figure in (learning_curves(results), success_by_evaluations(results), failed_stages(results)):
             _draw(figure)

@@ -155,7 +155,7 @@ def mutate_lines(lines: list[str], place: int, rng: random.Random) -> bytes:
 
 def mutate_one_value(data: bytes, rng: random.Random) -> bytes:
     """A value of JSON that stays JSON: what a command line may say."""
-    return dump(mutate_value(json.loads(data), rng)).encode()
+    return json.dumps(mutate_value(json.loads(data), rng)).encode()
 
 
 def mutate_yaml(data: bytes, rng: random.Random) -> bytes:
