@@ -17,7 +17,7 @@ from imfvla.options import build, require
 
 MAX_CHANNELS = 1000
 MAX_CAMERAS = 64
-MAX_CONTROL_HZ = 10_000.0
+MIN_CONTROL_HZ, MAX_CONTROL_HZ = 0.01, 10_000.0
 MAX_SIDE = 16_384  # of a picture [px]
 UNIT = re.compile(r"(.*\S) \[([^\[\]]*)\]")  # "left/joint_1 [rad]"
 
@@ -92,9 +92,9 @@ class RobotSpec:
                 (low, high),
             )
         require(
-            0 < self.control_hz <= MAX_CONTROL_HZ,
+            MIN_CONTROL_HZ <= self.control_hz <= MAX_CONTROL_HZ,
             "robot.control_hz",
-            f"above 0, up to {MAX_CONTROL_HZ:g}",
+            f"from {MIN_CONTROL_HZ:g} to {MAX_CONTROL_HZ:g}",
             self.control_hz,
         )
         names = [camera.name for camera in self.cameras]
