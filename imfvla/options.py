@@ -144,9 +144,9 @@ def require(condition: bool, key: str, wanted: str, found: Any) -> None:
         raise UserError(f"{key} must be {wanted}, found {shown(found)}.")
 
 
-def suggestion(name: str, known: Any) -> str:
+def suggestion(name: Any, known: Any) -> str:
     """The text " (did you mean ...?)" for a near miss, else nothing."""
-    near = get_close_matches(name, [str(other) for other in known], n=1)
+    near = get_close_matches(str(name), [str(other) for other in known], n=1)
     return f" (did you mean {near[0]}?)" if near else ""
 
 

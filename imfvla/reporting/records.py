@@ -53,15 +53,16 @@ class ProtocolRecord(TypedDict):
 
     task: Name
     variant: Name
-    checkpoint_step: Step
-    weights: Name
-    nfe: Nfe
-    noise_seed: Seed
     noise_scale: Share
-    first_seed: Seed
-    episodes: Count
-    max_steps: Annotated[int, within(1, MOST_STEPS)] | None
-    device: Name
+    # What differs from these in a comparison is named; older evaluations lack some.
+    checkpoint_step: NotRequired[Step]
+    weights: NotRequired[Name]
+    nfe: NotRequired[Nfe]
+    noise_seed: NotRequired[Seed]
+    first_seed: NotRequired[Seed]
+    episodes: NotRequired[Count]
+    max_steps: NotRequired[Annotated[int, within(1, MOST_STEPS)] | None]
+    device: NotRequired[Name]
 
 
 class Summary(TypedDict):

@@ -25,6 +25,6 @@ def read_metrics(path: Path) -> list[MetricsRow]:
         try:
             row = parse_json(line)
         except ValueError as error:
-            raise UserError(f"{where} is no row of metrics: {error}; {REMEDY}.") from error
+            raise UserError(f"{where} is not JSON: {error}; {REMEDY}.") from error
         rows.append(as_record(as_record(row, Metrics, where, REMEDY), MetricsRow, where, REMEDY))
     return rows

@@ -49,7 +49,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
             "nfe": 1,
             "checkpoint_step": 20,
             "seeds": [first_seed, first_seed],
-            "protocol": {"max_steps": None},
+            "protocol": {"task": "socket", "variant": "default", "max_steps": None},
             "fingerprint": {"machine": {"cpu": "a fast CPU"}},
         },
     )
