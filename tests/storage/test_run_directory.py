@@ -48,7 +48,7 @@ def test_ignored_keys_may_differ():
     [
         (None, "is not a run directory"),
         ("a: [", "cannot be read as YAML"),
-        ("- 1", "must be a mapping of keys to values"),
+        ("- 1", "must be a mapping of keys"),
     ],
 )
 def test_broken_config_is_reported(tmp_path, content, message):
