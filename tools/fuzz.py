@@ -116,7 +116,8 @@ def main() -> int:
         limit = psutil.Process().memory_info().vms + MAX_GROWTH_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         for name, target in chosen.items():
-            tally = fuzz(target, -(-options.files // len(chosen)), options.seed)
+            number = -(-options.files * target.share // sum(other.share for other in chosen.values()))
+            tally = fuzz(target, number, options.seed)
             failed += len(tally.failures)
             counts = {"refused": tally.refused, "read": tally.read, "failures": len(tally.failures)}
             rows[name] = counts | {"slowest_s": round(tally.slowest_s, 3)}

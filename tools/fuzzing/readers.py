@@ -39,6 +39,8 @@ from imfvla.storage.metrics import read_metrics
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, load_weights, save_state, save_weights
 
+SLOW = {"config", "options", "tables"}  # YAML, and a policy that is built
+QUICK = 16
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
     "observation.image_size=[32,32]",
@@ -56,6 +58,7 @@ class Target:
     path: Path
     read: Callable[[Path], Any]
     mutate: Callable[[bytes, random.Random], bytes]
+    share: int = 1  # of the files: more where one takes a millisecond
 
 
 def check_options(path: Path) -> None:
@@ -131,7 +134,8 @@ def make_readers(folder: Path) -> dict[str, Target]:
         "options": (options, check_options, mutate_one_value),
         "tables": (tables, read_mapping.__wrapped__, mutate_yaml),
     }
-    return {name: Target(*reader) for name, reader in (readers | outside_readers(folder / "outside")).items()}
+    ours = {name: Target(*reader, share=1 if name in SLOW else QUICK) for name, reader in readers.items()}
+    return ours | {name: Target(*reader) for name, reader in outside_readers(folder / "outside").items()}
 
 
 def outside_readers(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Any], Callable[..., bytes]]]:
