@@ -94,7 +94,7 @@ def folder_of(run: RunDirectory) -> Path:
         ("recordings", {"best": "x"}, "recordings.best must be a mapping"),
         ("recordings", {"best": {"seed": 1, "return": 1.0, "file": "../x.mcap"}}, "file must be the name of a file"),
         ("episodes", "3", "episodes must be a whole number, found '3'"),
-        ("episodes", 2, r"seeds must be \[100000, 100001\], as of 2 episodes"),
+        ("episodes", 2, "gives another episodes than its summary"),
         ("seeds", [0, 2**32 - 1], "seeds must be"),
         ("experiment", "", "experiment must be a text of 1 to 200"),
         ("experiment", "a\x1b[31m", "experiment must be a text of 1 to 200 printable"),
@@ -108,7 +108,7 @@ def test_a_summary_is_what_it_should_be(run, key, value, message):
     if message is None:
         print_row(run)
         return
-    with pytest.raises(UserError, match=rf"summary\.json.*{message}"):
+    with pytest.raises(UserError, match=message):
         print_row(run)
 
 

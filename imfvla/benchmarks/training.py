@@ -11,6 +11,7 @@ import torch
 
 from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
+from imfvla.benchmarks.forcing import measure_saving
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
 from imfvla.policy import Policy
@@ -50,6 +51,7 @@ def measure_training(
             if index == 2:  # the first steps warm up
                 spent.clear()
             _step(trainer, batches, spent)
+        saving = measure_saving(trainer)
     finally:
         batches.close()
         trainer.batches.close()
@@ -67,6 +69,7 @@ def measure_training(
         "achieved_gflops": flops / step_ms / 1e6,
         "peak_gflops": peak / 1e9,
         "share_of_peak": 1e3 * flops / step_ms / peak,
+        **saving,
     }
 
 

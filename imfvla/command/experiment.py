@@ -27,7 +27,8 @@ from imfvla.rollouts.offline import evaluate_offline
 from imfvla.sources.collection import check_demonstrations
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.sources.same_robot import refuse_other_robot
-from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, plain
+from imfvla.training.checkpoint import check_weights
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
@@ -53,7 +54,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         _check_source(config)
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
-    run.refuse_links_outside()
+    run.refuse_strangers()
     if has_environment(config) and run.status().get("state") != DONE:
         _check_environment(config)  # else training would end before an evaluation that fails
     with joined_processes(training.device) as processes:
@@ -124,6 +125,7 @@ def _run_stages(
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)
             if is_trained:
                 log.info(f"{run.path} is trained already: all {training.steps} steps are done.")
+                check_weights(run, evaluation.checkpoint)
             else:
                 _train(config, run, training, optim, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
@@ -181,7 +183,8 @@ def _train(
             "seed": seed,
             "num_parameters": num_parameters,
             "robot": robot_of(config).to_json(),
-            "config_digest": config_digest(config, EXECUTION_KEYS),
+            "config": plain(config),
+            "data": dict(windows.store.content),
         },
         processes=processes,
     )

@@ -16,6 +16,7 @@ from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from imfvla.errors import UserError
+from imfvla.storage.opening import DATA, open_to_read, size_of
 
 MAGIC = b"\x89MCAP0\r\n"  # at both ends of a file
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -73,8 +74,8 @@ def missing_end(path: Path) -> str | None:
 
     It follows lengths and reads no contents, so a damaged file is not taken for a cut-off one.
     """
-    size = path.stat().st_size
-    with path.open("rb") as stream:
+    with open_to_read(path, DATA) as stream:
+        size = size_of(stream)
         start = stream.read(len(MAGIC))
         if not MAGIC.startswith(start):
             return None

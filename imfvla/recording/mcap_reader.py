@@ -17,6 +17,7 @@ from imfvla.recording.mcap_file import MAX_EPISODE_BYTES, clear_read_errors, rec
 from imfvla.recording.pictures import decode, size_of
 from imfvla.robot import Camera
 from imfvla.storage.documents import parse_json
+from imfvla.storage.opening import RECORDING, open_to_read
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,9 @@ def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> 
     """
     path = Path(path)
     with clear_read_errors(path):
-        return _parse(path, path.read_bytes(), images)
+        with open_to_read(path, RECORDING) as stream:
+            data = stream.read()
+        return _parse(path, data, images)
 
 
 def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:

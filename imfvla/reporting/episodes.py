@@ -11,15 +11,15 @@ from imfvla.storage.records import as_record
 REMEDY = "restore the file or evaluate again with overwrite=true"
 
 
-def read_episodes(path: Path, seeds: range) -> tuple[Row, ...]:
-    """The rows of `path`, one for each of `seeds`, in their order.
+def read_episodes(path: Path, seeds: range, home: Path | None = None) -> tuple[Row, ...]:
+    """The rows of `path`, a file in the run directory `home`, one for each of `seeds`, in their order.
 
     Raises UserError naming file and line where a row is cut off, damaged, foreign, repeated or missing.
     """
     if not path.exists():
         raise UserError(f"{path} is missing beside its summary.json: {REMEDY}.")
     rows: dict[int, Row] = {}
-    for number, line in enumerate(read_lines(path, REMEDY), 1):
+    for number, line in enumerate(read_lines(path, REMEDY, home=home), 1):
         where = f"{path}, line {number}"
         row = read_row(line, where)
         if row["seed"] not in seeds:

@@ -137,7 +137,7 @@ def _evaluated(found: Evaluated, media: Media) -> str:
     folders = [evaluation.run, *(evaluation.run / name for name in RUN_FILES)]
     folders += [evaluation.folder, *(evaluation.folder / name for name in EVALUATION_FILES)]
     recordings = sorted(path for path in evaluation.folder.glob("*") if path.suffix in (".mcap", ".mp4"))
-    links = [anchor(path, media) for path in (*folders, *recordings) if path.exists()]
+    links = [anchor(path, evaluation.run, media) for path in (*folders, *recordings) if path.exists()]
     described = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in facts.items())
     return f"<dl>{described}<dt>files</dt><dd>{' · '.join(links)}</dd></dl>{_episodes(found.episodes)}"
 

@@ -22,10 +22,10 @@ def rollouts_of(result: Result, media: Media) -> str:
     )
 
 
-def anchor(path: Path, media: Media) -> str:
+def anchor(path: Path, run: Path, media: Media) -> str:
     """A link to a file under its own name, or to a directory under its path; the path alone where nothing is linked."""
     text = escape(path.as_posix() if path.is_dir() else path.name)
-    address = media.link(path)
+    address = media.link(path, run)
     return text if address is None else f'<a href="{address}">{text}</a>'
 
 
@@ -50,11 +50,11 @@ def _videos(found: Evaluated, media: Media) -> list[str]:
     folder, figures = found.evaluation.folder, []
     for label, recording in found.evaluation.summary.get("recordings", {}).items():
         mcap = folder / recording["file"]
-        video = media.link(mcap.with_suffix(".mp4"))
+        video = media.link(mcap.with_suffix(".mp4"), found.evaluation.run)
         if video is None:
             continue
         caption = f"{label}: seed {recording['seed']}, return {recording['return']:g}"
-        link = f" · {anchor(mcap, media)}" if mcap.exists() else ""
+        link = f" · {anchor(mcap, found.evaluation.run, media)}" if mcap.exists() else ""
         figures.append(
             f'<figure><video controls muted playsinline preload="none" src="{video}"></video>'
             f"<figcaption>{escape(caption)}{link}</figcaption></figure>"

@@ -68,21 +68,22 @@ class ProtocolRecord(TypedDict):
 class Summary(TypedDict):
     """`summary.json`."""
 
-    episodes: Annotated[int, within(1, MAX_EPISODES)]
-    avg_return: Amount
-    median_return: Amount
-    mean_max_reward: Amount
-    max_return: Amount
-    nonzero_episodes: Count
-    success_episodes: Count
-    inference_fps: Positive | None
-    control_fps: Duration | None
-    inference_ms_mean: Positive | None
-    inference_ms_median: Positive | None
-    inference_ms_p95: Positive | None
-    success_interval: Annotated[list[Share], of_length(2)]
+    # A copy of what its episodes say, whose numbers take their place: `recomputed`.
+    episodes: NotRequired[Annotated[int, within(1, MAX_EPISODES)]]
+    avg_return: NotRequired[Amount]
+    median_return: NotRequired[Amount]
+    mean_max_reward: NotRequired[Amount]
+    max_return: NotRequired[Amount]
+    nonzero_episodes: NotRequired[Count]
+    success_episodes: NotRequired[Count]
+    inference_fps: NotRequired[Positive | None]
+    control_fps: NotRequired[Duration | None]
+    inference_ms_mean: NotRequired[Positive | None]
+    inference_ms_median: NotRequired[Positive | None]
+    inference_ms_p95: NotRequired[Positive | None]
+    success_interval: NotRequired[Annotated[list[Share], of_length(2)]]
     success_of_goal: NotRequired[Mapping[str, Annotated[list[Count], of_length(2)]]]
-    failures: Annotated[Mapping[str, Count], at_most(1000)]
+    failures: NotRequired[Annotated[Mapping[str, Count], at_most(1000)]]
     name: FileName
     experiment: Name
     nfe: Nfe

@@ -5,15 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
+from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.metrics import Row
+from imfvla.reporting.recomputed import recomputed
 from imfvla.reporting.records import Summary
 from imfvla.storage.documents import read_json
 from imfvla.storage.records import as_record
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key
+from imfvla.storage.trained_config import DIGEST, refuse_changed_config, refuse_other_config
 
 REMEDY = "evaluate again with overwrite=true"
 # Of a summary, in the order of `table_row.json`.
@@ -26,12 +29,13 @@ METRICS = (
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """One finished evaluation of a run."""
+    """One finished evaluation of a run, every number of it from its episodes."""
 
     run: Path
     folder: Path
     summary: Summary  # `summary.json`, every metric in it, its protocol completed
     config: dict[str, Any]  # `config.yaml` of the run
+    episodes: tuple[Row, ...]  # in the order of their seeds
 
     @property
     def experiment(self) -> str:
@@ -98,7 +102,9 @@ def key_of(run: Path, experiment: str) -> str:
 
 
 def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
-    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary.
+    """All finished evaluations of a run, by folder name.
+
+    Raises UserError for broken summaries and episodes, and where config.yaml is not what was trained and evaluated.
 
     Pass `config` to avoid reading it again.
     """
@@ -141,21 +147,21 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
-    return Evaluation(run.path, folder, read_summary(folder / "summary.json"), config)
+    path = folder / "summary.json"
+    summary = read_summary(path, run.path)
+    refuse_changed_config(run, config, summary["checkpoint_step"])
+    refuse_other_config(config, run.path, path, summary.get(DIGEST))
+    summary, episodes = recomputed(folder, summary, home=run.path)
+    return Evaluation(run.path, folder, summary, config, episodes)
 
 
-def read_summary(path: Path) -> Summary:
-    """The summary of an evaluation, its protocol completed. Raises UserError for anything else."""
-    found = read_json(path, REMEDY, mapping=True)
+def read_summary(path: Path, home: Path | None = None) -> Summary:
+    """What a summary in the run `home` says, its protocol completed. Raises UserError for anything else."""
+    found = read_json(path, REMEDY, mapping=True, home=home)
     if isinstance(protocol := found.get("protocol"), dict):
         found |= {"protocol": as_recorded(protocol)}
     summary = as_record(found, Summary, str(path), REMEDY)
     first, last = summary["seeds"]
-    wanted = [first, first + summary["episodes"] - 1]
-    require(
-        summary["seeds"] == wanted,
-        f"{path}: seeds",
-        f"{wanted}, as of {summary['episodes']} episodes",
-        [first, last],
-    )
+    wanted = f"[first, last] of at most {MAX_EPISODES} episodes"
+    require(0 <= last - first < MAX_EPISODES, f"{path}: seeds", wanted, summary["seeds"])
     return summary

@@ -10,7 +10,8 @@ from typing import Any
 from imfvla.errors import UserError
 from imfvla.options import part_of
 from imfvla.reporting.runs import evaluations
-from imfvla.storage.files import clear_write_errors, copy_file, write_json, write_text
+from imfvla.storage.documents import read_lines
+from imfvla.storage.files import clear_write_errors, copy_file, locked, put_folder, write_json, write_text
 from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
@@ -26,8 +27,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
     weights above 8 MB, no reported evaluation, or a target that exists.
     """
-    if target.exists():
-        raise UserError(f"{target} exists already: remove it first.")
+    refuse_existing(target)
     state = run.status().get("state")
     if state != DONE:
         raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
@@ -41,21 +41,29 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
     recorded = [run.path / name for name in RECORDED if (run.path / name).exists()]
     copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
-    copied += sorted(weights.parent.iterdir()) if with_weights else []
+    copied += [weights.with_suffix(".json"), weights] if with_weights else []
     copied += [one.folder / name for one in reported for name in ("episodes.jsonl", "summary.json")]
-    rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
+    rows = read_lines(run.metrics, "restore it or train again")
     part = target.with_name(f".{target.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        for source in copied:
-            copy_file(source, part / source.relative_to(run.path))
-        write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
-        write_json(part / "made_by.json", made_by)
-        with clear_write_errors(target):
-            part.rename(target)
-    finally:
+    with locked(target):
+        refuse_existing(target)
         shutil.rmtree(part, ignore_errors=True)
+        try:
+            for source in copied:
+                copy_file(source, part / source.relative_to(run.path), home=run.path)
+            write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
+            write_json(part / "made_by.json", made_by)
+            with clear_write_errors(target):
+                put_folder(part, target)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
     return made_by
+
+
+def refuse_existing(target: Path) -> None:
+    """Raises UserError where there is something already."""
+    if target.exists():
+        raise UserError(f"{target} exists already: remove it first.")
 
 
 def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ from imfvla.process.progress import Progress
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.sources.demonstrations import Settings, settings_of
-from imfvla.storage.files import clear_write_errors, locked, write_json
+from imfvla.storage.files import clear_write_errors, delete_leftovers, locked, put_file, write_json
 from imfvla.storage.fingerprint import physical_cores
 from imfvla.storage.records import Seed, read_record
 
@@ -180,7 +180,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     result = run_episode(env, expert, seed, [sink], kind="demonstration", config=settings.to_json())
     with clear_write_errors(path):
         if result.success:
-            trial.replace(path)
+            put_file(trial, path)
         else:
             trial.unlink()
     return seed, result.success
@@ -199,6 +199,7 @@ class _Log:
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._path = directory / LOG_NAME
+        delete_leftovers(self._path)
         self._remedy = f"choose another demos.directory, or move {directory} away to record it again"
         env, _ = _stage_for(settings)
         self._settings = json.loads(json.dumps(settings.to_json())) | {"model": env.model_digest()}

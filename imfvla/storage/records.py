@@ -122,6 +122,6 @@ def as_record(value: Any, hint: Any, where: str, remedy: str) -> Any:
         raise UserError(f"{where}{text[2:] if is_whole else f': {text}'}; {remedy}.") from error
 
 
-def read_record(path: Path, hint: Any, remedy: str) -> Any:
-    """The value of a JSON file as the type `hint`. Raises UserError, ending with `remedy`, for anything else."""
-    return as_record(read_json(path, remedy), hint, str(path), remedy)
+def read_record(path: Path, hint: Any, remedy: str, *, home: Path | None = None) -> Any:
+    """The value of a JSON file in `home` as the type `hint`. Raises UserError, ending with `remedy`, for all others."""
+    return as_record(read_json(path, remedy, home=home), hint, str(path), remedy)

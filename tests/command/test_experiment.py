@@ -56,7 +56,8 @@ def test_does_all_stages_once(calls, tmp_path):
     assert run.weight_steps() == [2, 4]
     assert [row["step"] for row in read_metrics(run.metrics)] == [1, 2, 3, 4]
     described = json.loads(run.policy_weights().with_suffix(".json").read_text())
-    assert {"step", "seed", "config_digest", "precision", "fingerprint"} <= described.keys()
+    assert {"step", "seed", "data", "precision", "fingerprint"} <= described.keys()
+    assert described["config"] == run.config()
     assert described["fingerprint"]["threads"] == 1
 
     files = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"}

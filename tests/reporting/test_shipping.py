@@ -13,6 +13,9 @@ from imfvla.storage.files import write_json
 from imfvla.storage.run_directory import DONE, RUNNING, RunDirectory
 
 EPISODE = {
+    "seed": 100_000,
+    "start_digest": "0" * 16,
+    "first_step_of_stage": [],
     "total_reward": 900.0,
     "num_steps": 700,
     "max_reward": 5.0,
@@ -38,7 +41,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
     run.metrics.write_text("".join(f'{{"step": {step}}}\n' for step in range(1, 31)))
     folder = run.rollouts("reported")
     folder.mkdir(parents=True)
-    (folder / "episodes.jsonl").write_text(json.dumps(EPISODE) + "\n")
+    (folder / "episodes.jsonl").write_text(json.dumps(EPISODE | {"seed": first_seed}) + "\n")
     (folder / "median.mcap").write_bytes(b"large")
     write_json(
         folder / "summary.json",

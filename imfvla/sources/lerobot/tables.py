@@ -10,6 +10,7 @@ import numpy as np
 from imfvla.errors import UserError, unreadable
 from imfvla.sources.checks import MAX_EPISODES, MAX_STEPS, misfit, missing_extra, shortened
 from imfvla.sources.lerobot.layout import DOWNLOAD, INFO, TASKS, Info
+from imfvla.storage.opening import ANYWHERE, DATA, checked
 
 try:
     import pyarrow as pa
@@ -46,7 +47,7 @@ def read_episodes(info: Info, video_keys: Sequence[str]) -> Episodes:
     times = [f"videos/{key}/from_timestamp" for key in video_keys]
     names = [*whole, *places, *times]
     found: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    total = sum(_num_rows(path) for path in files)
+    total = sum(_num_rows(path, info.home) for path in files)
     if total != info.num_episodes:
         raise misfit(
             info.root / "meta/episodes",
@@ -99,7 +100,7 @@ def read_episodes(info: Info, video_keys: Sequence[str]) -> Episodes:
 def read_tasks(info: Info) -> dict[int, str]:
     """The sentence of each task_index. Raises UserError where the table is missing or damaged."""
     path = info.root / TASKS
-    with clear_errors(path), pq.ParquetFile(path) as file:
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=info.home)) as file:
         if file.metadata.num_rows > MAX_TASKS:
             raise misfit(path, "its number of rows", f"at most {MAX_TASKS}", file.metadata.num_rows, DOWNLOAD)
         names = file.schema_arrow.names
@@ -124,8 +125,11 @@ def read_rows(path: Path, columns: Sequence[str], first: int, count: int) -> pa.
 
 
 def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -> Iterator[pa.Table]:
-    """The rows from `first` on, at most `BATCH` at a time; only row groups with wanted rows are read."""
-    with clear_errors(path), pq.ParquetFile(path, memory_map=True) as file:
+    """The rows from `first` on, at most `BATCH` at a time; only row groups with wanted rows are read.
+
+    `path` is a file that `layout.inside` gave, or one checked to lie in the data set.
+    """
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=ANYWHERE), memory_map=True) as file:
         known = file.schema_arrow.names
         if lacking := [name for name in columns if name not in known]:
             raise misfit(
@@ -202,8 +206,8 @@ def _plain(column: pa.Array, name: str, path: Path) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def _num_rows(path: Path) -> int:
-    with clear_errors(path), pq.ParquetFile(path) as file:
+def _num_rows(path: Path, home: Path) -> int:
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=home)) as file:
         count = file.metadata.num_rows
     if count > MAX_EPISODES:
         raise misfit(path, "its number of rows", f"at most {MAX_EPISODES}", count, DOWNLOAD)

@@ -12,6 +12,7 @@ from mcap.records import Channel, Message, Schema
 from imfvla.errors import UserError, unreadable
 from imfvla.recording.mcap_file import missing_end, streamed_records
 from imfvla.sources.checks import misfit, missing_extra, shortened
+from imfvla.storage.opening import ANYWHERE, DATA, open_to_read, real_path, size_of
 
 try:
     from mcap_ros2.decoder import DecoderFactory
@@ -74,6 +75,8 @@ def _bags_at(path: Path) -> list[Bag]:
     if not path.is_dir():
         raise UserError(f"There is no bag {path}: give the path of a .mcap file or of a bag's folder.")
     entries = sorted(path.iterdir(), key=lambda entry: _natural(entry.name))
+    for entry in entries:
+        real_path(entry)
     files = [
         _supported(entry) for entry in entries if entry.is_file() and re.search(r"\.(mcap|db3)\b", entry.name)
     ]
@@ -109,8 +112,8 @@ def received(bag: Bag, topics: Collection[str]) -> Iterator[Received]:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         factory = DecoderFactory()
-        with clear_errors(path), path.open("rb") as stream:
-            for record in streamed_records(stream, path.stat().st_size, MAX_BAG_BYTES):
+        with clear_errors(path), open_to_read(path, DATA, home=ANYWHERE) as stream:
+            for record in streamed_records(stream, size_of(stream), MAX_BAG_BYTES):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -130,8 +133,8 @@ def topics_of(bag: Bag) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in bag.files:
         schemas: dict[int, str] = {}
-        with clear_errors(path), path.open("rb") as stream:
-            for record in streamed_records(stream, path.stat().st_size, MAX_BAG_BYTES):
+        with clear_errors(path), open_to_read(path, DATA, home=ANYWHERE) as stream:
+            for record in streamed_records(stream, size_of(stream), MAX_BAG_BYTES):
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
