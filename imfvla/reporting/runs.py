@@ -158,6 +158,7 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
 def read_summary(path: Path, home: Path | None = None) -> Summary:
     """What a summary in the run `home` says, its protocol completed. Raises UserError for anything else."""
     found = read_json(path, REMEDY, mapping=True, home=home)
+    found.setdefault("name", path.parent.name)
     if isinstance(protocol := found.get("protocol"), dict):
         found |= {"protocol": as_recorded(protocol)}
     summary = as_record(found, Summary, str(path), REMEDY)
