@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from fakes import build_fakes
+from fakes import FakeEnvironment, build_fakes
 from mcap_check import check
 from mcap_to_mp4 import export
 from synthetic import write_episode
@@ -86,7 +86,7 @@ def make_consumers(folder: Path) -> dict[str, Target]:
     _write_evaluated(evaluated)
     finished = _rollouts_of(evaluated)
     shutil.copytree(evaluated, interrupted)
-    _interrupt(_rollouts_of(interrupted))
+    _interrupt(interrupted)
     _write_resumed(resumed)
     offline = _write_offline(folder / "offline" / "default")
     recording = folder / "recordings" / "episode.mcap"
@@ -214,28 +214,28 @@ def _write_evaluated(run: Path) -> None:
     evaluate(RunDirectory(run), EVALUATION, build=build_fakes)
 
 
-def _interrupt(folder: Path) -> None:
-    """Turns a finished evaluation into one that stopped after two rows."""
-    rows = (folder / "episodes.jsonl").read_text(encoding="utf-8").splitlines(keepends=True)
-    (folder / "summary.json").unlink()
-    (folder / "episodes.jsonl").unlink()
+class Stopped(Exception):
+    """Ends an evaluation."""
 
-    class Stopped(Exception):
-        pass
 
-    # The header is written by the evaluation itself.
-    (folder / PARTIAL).write_text("", encoding="utf-8")
-    header = ""
+class StoppingEnvironment(FakeEnvironment):
+    """Stops at the last episode."""
 
-    def read_header(run: Path, step: int) -> Any:
-        nonlocal header
-        header = (folder / PARTIAL).read_text(encoding="utf-8")
-        raise Stopped
+    def reset(self, seed: int) -> None:
+        if seed == EVALUATION.first_seed + EVALUATION.episodes - 1:
+            raise Stopped
+        super().reset(seed)
+
+
+def _interrupt(run: Path) -> None:
+    """Turns a finished evaluation into one that stopped before its last episode."""
+    shutil.rmtree(run / "rollouts")
+
+    def build(run: Path, step: int) -> Any:
+        return StoppingEnvironment(), build_fakes(run, step)[1]
 
     with suppress(Stopped):
-        evaluate(RunDirectory(folder.parents[1]), EVALUATION, build=read_header)
-    folder.mkdir(exist_ok=True)
-    (folder / PARTIAL).write_text(header + "".join(rows[:2]), encoding="utf-8")
+        evaluate(RunDirectory(run), EVALUATION, build=build)
 
 
 def _write_resumed(run: Path) -> None:

@@ -91,6 +91,7 @@ def make_readers(folder: Path) -> dict[str, Target]:
     seeds = range(100_000, 100_003)
     partial = RolloutLog(folder / "partial", {"nfe": 1})
     with partial:
+        partial.begin()
         for line in (rollouts / "episodes.jsonl").read_text(encoding="utf-8").splitlines():
             partial.append(json.loads(line))
     depth = folder / "depth_attention.json"
@@ -109,6 +110,7 @@ def make_readers(folder: Path) -> dict[str, Target]:
 
     def reopen(path: Path) -> None:
         with RolloutLog(path.parent, {"nfe": 1}) as log:
+            log.begin()
             [row["seed"] for row in log.rows]
 
     def report(run: RunDirectory) -> list[Any]:
