@@ -13,18 +13,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
 from imfvla.data.checksums import checked_sums, digest_of, remember, with_checksums
 from imfvla.data.resample import resample
 from imfvla.errors import UserError
+from imfvla.options import at_most, of_length, within, within_length
+from imfvla.robot import MAX_CAMERAS, MAX_SIDE
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
 from imfvla.sources.validation import check_episode
 from imfvla.storage.documents import read_json
 from imfvla.storage.files import clear_folder, locked, make_folder, put_folder, write_remedy
 from imfvla.storage.opening import ARRAY, checked
+from imfvla.storage.records import read_record
 
 FORMAT = 2
 IMAGES = "images.raw"
@@ -33,6 +36,26 @@ FILES = {*ARRAYS, "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
 
 Progress = Callable[[int, int], None]  # called with (episodes done, episodes in all)
+
+
+class EpisodeEntry(TypedDict):
+    """An episode in `meta.json`."""
+
+    name: str
+    task: str
+    instructions: Annotated[list[Annotated[str, at_most(10_000)]], within_length(1, 10_000)]
+    num_steps: Annotated[int, within(1, 10**7)]
+    num_frames: Annotated[int, within(0, 10**7)]
+
+
+class StoreMeta(TypedDict):
+    """`meta.json`."""
+
+    format: int
+    digest: str
+    views: Annotated[list[str], within_length(1, MAX_CAMERAS)]
+    image_size: Annotated[list[Annotated[int, within(1, MAX_SIDE)]], of_length(2)]
+    episodes: list[EpisodeEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +95,7 @@ class FrameStore:
         """
         path = Path(path)
         try:
-            meta = read_json(path / "meta.json", "delete the store", mapping=True)
+            meta = read_record(path / "meta.json", StoreMeta, "delete the store")
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
             sums = checked_sums(path, meta, ARRAYS)
@@ -92,6 +115,7 @@ class FrameStore:
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
+            _check_arrays(state, action, image_steps, episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it, or choose another folder with "
@@ -127,6 +151,22 @@ class FrameStore:
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
+
+
+def _check_arrays(
+    state: np.ndarray, action: np.ndarray, image_steps: np.ndarray, episodes: Sequence[StoredEpisode]
+) -> None:
+    """Raises ValueError where arrays are not of the types that `build` writes, or have frames of no step."""
+    for name, array, kind, dimensions in (
+        ("state", state, np.float32, 2),
+        ("action", action, np.float32, 2),
+        ("image_steps", image_steps, np.int64, 1),
+    ):
+        if array.dtype != kind or array.ndim != dimensions:
+            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
+    lengths = np.repeat([e.num_steps for e in episodes], [len(e.image_steps) for e in episodes])
+    if (image_steps < 0).any() or (image_steps >= lengths).any():
+        raise ValueError("image_steps are not all of its episodes' steps")
 
 
 def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:

@@ -65,7 +65,13 @@ class Sheet:
         Raises ValueError where it would become unreadable.
         """
         size *= SCALE
-        options = {"ha": "center", "va": "center", "color": INK, "linespacing": 1.35} | options
+        options = {
+            "ha": "center",
+            "va": "center",
+            "color": INK,
+            "linespacing": 1.35,
+            "parse_math": True,
+        } | options
         drawn = self.axes.text(x, y, text, fontsize=size, **options)
         if width is None:
             return

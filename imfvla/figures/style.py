@@ -28,6 +28,7 @@ STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "figure.facecolor": "white",
+    "text.parse_math": False,  # names come from files, and a "$" in one is a "$"; diagrams allow it for themselves
     "svg.fonttype": "path",
     "svg.hashsalt": "imfvla",  # element names, random otherwise
 }

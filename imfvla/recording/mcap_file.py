@@ -131,3 +131,23 @@ def clear_read_errors(path: Path) -> Iterator[None]:
             f"Recording {path} is damaged or not an episode of imfvla ({reason}): restore it from a copy, or move it "
             "away and collect or evaluate again."
         ) from error
+
+
+def misplaced_end(data: bytes) -> str | None:
+    """What is wrong with the end of a file whose records are whole: bytes behind it, or an index that is elsewhere."""
+    place, data_end = len(MAGIC), 0
+    while place + RECORD_HEAD.size <= len(data):
+        opcode, length = RECORD_HEAD.unpack_from(data, place)
+        end = place + RECORD_HEAD.size + length
+        if opcode == Opcode.DATA_END:
+            data_end = end
+        elif opcode == Opcode.FOOTER:
+            if behind := len(data) - end - len(MAGIC):
+                return f"{behind} bytes are behind its end"
+            (stated,) = struct.unpack_from("<Q", data, place + RECORD_HEAD.size)
+            wanted = 0 if data_end == place else data_end  # 0 where there is no index
+            return (
+                None if stated == wanted else f"its index begins at byte {wanted}, its footer says {stated}"
+            )
+        place = end
+    return "it has no footer"

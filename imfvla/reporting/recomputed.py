@@ -10,7 +10,7 @@ from typing import Any
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import REMEDY, read_episodes
 from imfvla.reporting.metrics import summarise
-from imfvla.reporting.rows import Row
+from imfvla.reporting.records import Row
 from imfvla.storage.opening import ROWS, open_to_read
 
 EPISODES = "episodes.jsonl"

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
+from imfvla.options import part_of
 from imfvla.reporting.runs import evaluations
-from imfvla.storage.documents import read_json, read_lines
+from imfvla.storage.documents import read_lines
 from imfvla.storage.files import clear_write_errors, copy_file, locked, put_folder, write_json, write_text
+from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
 MAX_BYTES = 8_000_000  # of the weights
@@ -73,18 +75,18 @@ def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
         key = text.partition("=")[0]
         value = values.get(key)
         overrides.append(f"{key}=[{','.join(map(str, value))}]" if isinstance(value, list) else text)
-    return shlex.join(["python", "-m", "imfvla.train", f"+exp={config['name']}", *overrides])
+    return shlex.join(["python", "-m", "imfvla.train", f"+exp={part_of(config, 'name')}", *overrides])
 
 
 def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
     """Command, commit, seed and results of a run."""
     config = run.config()
-    made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
+    made = read_record(weights.with_suffix(".json"), WeightsDescription, "restore it or train again")
     shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
     return {
         "command": command_of(run, config),
-        "seed": config["seed"],
-        "code": made["fingerprint"]["code"],
+        "seed": part_of(config, "seed"),
+        "code": made["fingerprint"].get("code"),
         "steps": made["step"],
         "train_s": made["train_s"],
         "machine": made["fingerprint"]["machine"],

@@ -199,9 +199,10 @@ def _notes(duel: Duel) -> tuple[str, ...]:
         )
     protocol, seeds = duel.ours.evaluation.summary["protocol"], duel.ours.evaluation.seeds
     task = f"{protocol['task']} ({protocol['variant']}), seeds {seeds[0]} to {seeds[-1]}"
+    noise_seed = protocol.get("noise_seed", 0)
     return (
         *described,
-        f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A minus B, speed is "
+        f"{task}, noise seed {noise_seed}. In brackets: 95% intervals. Differences are A minus B, speed is "
         "B's time over A's. p is two-sided, for one comparison alone and after Holm's correction over the whole table. "
         "Detectable: the smallest difference "
         f"in favour of A that so many pairs would have shown with probability {POWER} at p = {ALPHA}.",

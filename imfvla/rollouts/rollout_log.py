@@ -9,13 +9,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from imfvla.config.protocol import as_recorded
 from imfvla.errors import UserError
-from imfvla.reporting.episodes import read_row
+from imfvla.reporting.episodes import check_goals, read_row
 from imfvla.reporting.recomputed import DIGEST as EPISODES_DIGEST
 from imfvla.reporting.recomputed import EPISODES, digest_of, recomputed
-from imfvla.reporting.rows import Row
-from imfvla.storage.documents import parse_json, read_json, read_text
+from imfvla.reporting.records import Row
+from imfvla.reporting.runs import read_summary
+from imfvla.storage.documents import parse_json, read_text
 from imfvla.storage.files import (
     clear_write_errors,
     delete_leftovers,
@@ -116,9 +116,8 @@ class RolloutLog:
         path = self.path / "summary.json"
         if not path.exists():
             return None
-        summary = read_json(path, "delete it and evaluate again", mapping=True)
-        recorded = summary.get("protocol")
-        if isinstance(recorded, dict) and as_recorded(recorded) == self._protocol:
+        summary = read_summary(path)
+        if summary["protocol"] == self._protocol:
             summary, _ = recomputed(self.path, summary)
             log.info("%s is finished already; overwrite=true repeats it.", self.path)
             return summary
@@ -134,6 +133,7 @@ class RolloutLog:
         try:
             found = parse_json(lines[0]) if lines else None
             rows = [read_row(line, PARTIAL) for line in lines[1:]]
+            check_goals(rows, PARTIAL)
         except (ValueError, UserError):
             found, rows = "damaged", []
         if found == header:

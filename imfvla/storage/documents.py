@@ -11,13 +11,20 @@ import yaml
 from imfvla.errors import UserError, unreadable
 from imfvla.storage.opening import JSON, ROWS, YAML, Kind, open_to_read
 
+MAX_LINES = 1_000_000  # of JSON
 MAX_YAML_DEPTH = 64
+MAX_YAML_VALUES = 20_000  # keys, values, lists and mappings; each takes some 0.1 ms
 
 
 class ChosenLoader(yaml.SafeLoader):
-    """Safe, and without aliases, nine lines of which unfold to billions of values."""
+    """Safe, bounded, and without aliases, nine lines of which unfold to billions of values."""
+
+    num_values = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self.num_values += 1
+        if self.num_values > MAX_YAML_VALUES:
+            raise yaml.YAMLError(f"it has more than {MAX_YAML_VALUES} keys and values")
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError(f"line {self.peek_event().start_mark.line + 1} has an alias, wanted values")
         return super().compose_node(parent, index)
@@ -86,7 +93,10 @@ def read_lines(path: Path, remedy: str, *, home: Path | None = None) -> list[str
     Raises UserError, ending with `remedy`, where it cannot be read, and where `storage.opening` refuses it.
     """
     try:
-        return read_text(path, ROWS, home=home).splitlines(keepends=True)
+        text = read_text(path, ROWS, home=home)
+        if (found := text.count("\n")) > MAX_LINES:
+            raise ValueError(f"it has {found} lines, wanted at most {MAX_LINES}")
+        return text.splitlines(keepends=True)
     except UserError:
         raise
     except (OSError, ValueError) as error:

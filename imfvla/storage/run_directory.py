@@ -22,7 +22,7 @@ import yaml
 from imfvla.config.protocol import CHECKPOINT, LAST
 from imfvla.errors import UserError, unreadable
 from imfvla.options import require
-from imfvla.storage.documents import read_json, read_yaml
+from imfvla.storage.documents import read_yaml
 from imfvla.storage.files import (
     clear_write_errors,
     delete_leftovers,
@@ -33,8 +33,9 @@ from imfvla.storage.files import (
     write_text,
 )
 from imfvla.storage.opening import WEIGHTS, open_to_append, open_to_read, refuse_strangers
+from imfvla.storage.records import STATES, RunConfig, Status, as_record, read_record
 
-RUNNING, DONE, FAILED = "running", "done", "failed"
+RUNNING, DONE, FAILED = STATES
 PARENTS = 3  # runs/<experiment>/<name>, which Hydra makes without forcing them to disk
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
@@ -140,9 +141,7 @@ class RunDirectory:
             config = read_yaml(path)
         except FileNotFoundError:
             raise UserError(f"{self.path} is not a run directory: it has no {path.name}.") from None
-        if not isinstance(config, dict):
-            raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
-        return config
+        return as_record(config, RunConfig, str(path), "restore it from a copy")
 
     def refuse_strangers(self) -> None:
         """Raises UserError where a link would redirect writes to somewhere else, or a pipe would block them."""
@@ -172,7 +171,7 @@ class RunDirectory:
         path = self.path / "status.json"
         if not path.exists():
             return {}
-        return read_json(path, "delete it and run again", mapping=True)
+        return read_record(path, Status, "delete it and run again")
 
     def write_status(self, state: str, **details: Any) -> None:
         """state: running, done or failed; `details` (step, error, ...) replace those of before."""

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.storage.documents import read_json
+from imfvla.options import Plain
+from imfvla.storage.records import read_record
 from imfvla.storage.run_directory import (
     DERIVED_KEYS,
     EXECUTION_KEYS,
@@ -76,7 +77,7 @@ def trained_data(run: RunDirectory, step: int) -> Mapping[str, str] | None:
 def _made_by(run: RunDirectory, step: int) -> tuple[Path, dict[str, Any]]:
     """What the weights of `step` say of their training, and the file that says it; {} where it is missing."""
     path = run.weights_directory(step) / "policy.json"
-    return path, read_json(path, "restore it", mapping=True, home=run.path) if path.exists() else {}
+    return path, read_record(path, Mapping[str, Plain], "restore it", home=run.path) if path.exists() else {}
 
 
 def is_digest_of(config: Mapping[str, Any], digest: Any) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from imfvla.errors import UserError, unreadable
+from imfvla.options import Number, Plain, at_most, one_of, within
 from imfvla.policy import Policy, build_policy
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import KEY
@@ -37,23 +38,36 @@ from imfvla.storage.files import (
     write_json,
 )
 from imfvla.storage.opening import WEIGHTS, Kind, checked
+from imfvla.storage.records import Duration, Step, as_record
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.trained_config import refuse_changed_config
+from imfvla.training.precision import PRECISIONS
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"
 WEIGHTS_FORMAT = "imfvla-policy-1"
 MAX_HEADER_BYTES = 16 * 2**20  # of a safetensors file: names, shapes and details
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
-# What the loop resumes from besides the tensors, with types.
-DETAILS = {
-    "step": (int,),
-    "train_s": (int, float),
-    "precision": (str,),
-    "gradient_scale": (float, type(None)),  # None where every step so far was left out
-    "batches": (dict,),
-    "logger": (dict,),
-}
+
+
+class LoggerState(TypedDict):
+    """The interval that has begun: sums of scalars over so many steps."""
+
+    sums: Annotated[Mapping[str, Number], at_most(1000)]
+    count: NotRequired[Step]
+    skipped: NotRequired[Step]
+
+
+class Details(TypedDict):
+    """What the loop resumes from besides the tensors."""
+
+    step: Step
+    train_s: Duration
+    precision: Annotated[str, one_of(*PRECISIONS)]
+    # Of the gradients; None where every step so far was left out.
+    gradient_scale: Annotated[float, within(0, 1e300)] | None
+    batches: Mapping[str, Plain]  # checked by those who load it
+    logger: LoggerState
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +96,7 @@ def save_state(path: Path, state: TrainState, details: Mapping[str, Any], *, wri
         write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
 
-def load_state(path: Path, state: TrainState) -> dict[str, Any]:
+def load_state(path: Path, state: TrainState) -> Details:
     """Fills `state` from a file of `save_state` and returns its details; a mismatch changes nothing."""
     most = 2 * num_bytes(state.policy.parameters())  # AdamW's moments
     most += num_bytes(state.policy.state_dict().values()) + num_bytes(state.averaged.state_dict().values())
@@ -258,18 +272,14 @@ def _damaged(path: Path, error: Exception) -> UserError:
     return UserError(f"{path} is cut off or damaged ({error}): restore it, or move it away and train again.")
 
 
-def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
+def _read_details(path: Path, header: Mapping[str, str]) -> Details:
     """The details that `save_state` got. Raises UserError where they are not what the loop saves."""
+    remedy = "restore it, or move it away and train again"
     try:
-        details = parse_json(header["details"])
-        kinds = {key: type(details[key]) for key in DETAILS}
-        if any(kinds[key] not in DETAILS[key] for key in DETAILS) or details["step"] < 0:
-            raise ValueError(f"wanted {DETAILS}, found {kinds}")
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} has a damaged header ({error!r}): restore it, or move it away and train again."
-        ) from error
-    return details
+        details = parse_json(header.get("details", ""))
+    except ValueError as error:
+        raise UserError(f"{path} has a damaged header ({error}): {remedy}.") from error
+    return as_record(details, Details, f"{path}, details", remedy)
 
 
 def _refuse_misfits(path: Path, wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:

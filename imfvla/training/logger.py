@@ -8,9 +8,8 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from imfvla.errors import UserError
-from imfvla.storage.documents import parse_json, read_lines
 from imfvla.storage.files import clear_write_errors, make_folder, sync, write_text
+from imfvla.storage.metrics import read_metrics
 from imfvla.storage.opening import open_to_append
 from imfvla.storage.run_directory import RunDirectory
 
@@ -32,7 +31,7 @@ class MetricsLogger:
         with clear_write_errors(run.tensorboard):
             self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
         self._sums: dict[str, float] = dict(state["sums"]) if state else {}
-        self._count: int = state["count"] if state else 0
+        self._count: int = state.get("count", 0) if state else 0
         self._skipped: int = state.get("skipped", 0) if state else 0
 
     def add(self, scalars: Mapping[str, float]) -> None:
@@ -96,26 +95,6 @@ class SilentLogger(MetricsLogger):
 
     def close(self) -> None:
         pass
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl, without a last line that a kill cut off. Raises UserError if damaged."""
-    if not path.exists():
-        return []
-    rows = []
-    lines = read_lines(path, "restore or delete the file")
-    for number, line in enumerate(lines, 1):
-        try:
-            row = parse_json(line)
-            if not isinstance(row, dict) or not isinstance(row.get("step"), int):
-                raise ValueError("wanted a mapping with a step")
-            rows.append(row)
-        except ValueError as error:
-            if number < len(lines):
-                raise UserError(
-                    f"{path}, line {number} is not JSON of a row: {error}; restore or delete the file."
-                ) from error
-    return rows
 
 
 def _truncate(path: Path, step: int) -> None:

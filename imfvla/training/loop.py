@@ -31,13 +31,12 @@ from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.origin import Origin
 from imfvla.training.parallel import Alone
-from imfvla.training.precision import autocast, choose_precision
+from imfvla.training.precision import PRECISIONS, autocast, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.training.sharding import FULL, release, shard, whole
 from imfvla.training.spans import Span, Spans
 from imfvla.types import Batch
 
-PRECISIONS = ("fp32", "bf16")
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
 log = logging.getLogger(__name__)
 

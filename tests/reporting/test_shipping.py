@@ -33,7 +33,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
         weights = run.weights_directory(step) / "policy.safetensors"
         write_json(
             weights.with_suffix(".json"),
-            {"step": step, "train_s": 60.0, "fingerprint": {"code": "abc", "machine": {}}},
+            {"step": step, "train_s": 60.0, "fingerprint": {"code": {"commit": "abc"}, "machine": {}}},
         )
         weights.write_bytes(bytes(size))
     run.last_state.parent.mkdir()
@@ -52,7 +52,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
             "nfe": 1,
             "checkpoint_step": 20,
             "seeds": [first_seed, first_seed],
-            "protocol": {"max_steps": None},
+            "protocol": {"task": "socket", "variant": "default", "max_steps": None},
             "fingerprint": {"machine": {"cpu": "a fast CPU"}},
         },
     )
@@ -75,7 +75,7 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     }
     assert (tmp_path / "shipped" / "metrics.jsonl").read_text().count("\n") == 3
     assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
-    assert (made_by["code"], made_by["seed"]) == ("abc", 3)
+    assert (made_by["code"], made_by["seed"]) == ({"commit": "abc"}, 3)
     assert made_by["results"]["reported"]["success_episodes"] == 1
 
 

@@ -220,6 +220,7 @@ def test_an_evaluation_from_before_noise_had_a_scale_is_not_repeated(run):
     path = run.rollouts(NAME) / "summary.json"
     del summary["protocol"]["noise_scale"]
     path.write_text(json.dumps(summary))
+    summary["protocol"]["noise_scale"] = 1.0
     assert roll(run) == [summary]
 
 
