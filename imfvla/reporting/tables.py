@@ -276,13 +276,21 @@ def _data_row(result: Result) -> tuple[str, ...]:
 def _comparison_data(compared: Sequence[Compared]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
     columns = (
         "comparison", "metric", "row", "baseline", "of", "operation", "paper", "ours", "ours_low", "ours_high", "p",
-        "p_holm", "status", "reason",
+        "p_holm", "p_signed_rank", "p_signed_rank_holm", "status", "reason",
     )  # fmt: skip
     cells = []
     for found in compared:
         comparison, paper = found.comparison, found.comparison.paper
         result = found.result or Measured(None)
-        numbers = (result.value, result.low, result.high, found.p, found.p_holm)
+        numbers = (
+            result.value,
+            result.low,
+            result.high,
+            found.p,
+            found.p_holm,
+            found.p_ranks,
+            found.p_ranks_holm,
+        )
         cells.append(
             (
                 paper.comparison, paper.metric, found.row.name, found.baseline.name, comparison.of,
