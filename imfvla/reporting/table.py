@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 import re
 import sys
 from dataclasses import dataclass
@@ -28,7 +29,9 @@ MISSING, REFUSED = "missing", "refused"
 FILL = "What is missing is filled by:"
 VALUE = r"[-+<]?[\d.]+(?:/\d+)?[%×]?"  # a number, a count of so many, a share, a ratio, a bound
 # alone or with its interval, and with its unit
-NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?(?: ms| points)?"
+TOO_FEW = "[too few]"  # for an interval
+INTERVAL = rf" \[{VALUE}, {VALUE}\]|-{VALUE}| {re.escape(TOO_FEW)}"
+NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?:{INTERVAL})?(?: ms| points)?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +124,11 @@ def with_interval(measured: Measured, digits: int, unit: str = "") -> str:
     if measured.value is None:
         return NOTHING
     text = f"{measured.value:.{digits}f}{unit}"
-    return text if measured.low is None else f"{text} {interval(measured, digits, unit)}"
+    return f"{text} {interval(measured, digits, unit)}" if math.isfinite(measured.value) else text
 
 
 def interval(measured: Measured, digits: int, unit: str = "") -> str:
-    """As in "[75.6%, 89.9%]", empty where there is none."""
+    """As in "[75.6%, 89.9%]", or that too few episodes have none."""
     if measured.low is None or measured.high is None:
-        return ""
+        return TOO_FEW
     return f"[{measured.low:.{digits}f}{unit}, {measured.high:.{digits}f}{unit}]"

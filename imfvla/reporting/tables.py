@@ -10,7 +10,7 @@ from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
-from imfvla.reporting.table import MISSING, NOTHING, REFUSED, Table, interval, number, with_interval
+from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.run_directory import LAST
 
@@ -191,8 +191,8 @@ def shown(found: Compared) -> str:
     if found.comparison.operation != "difference":
         return with_interval(found.result, 2, "×")
     value = found.result
-    bounds = "" if value.low is None else f" [{value.low:+.1f}, {value.high:+.1f}]"
-    return f"{value.value:+g}{bounds}"
+    bounds = TOO_FEW if value.low is None else f"[{value.low:+.1f}, {value.high:+.1f}]"
+    return f"{value.value:+g} {bounds}"
 
 
 def p_value(p: float | None) -> str:
