@@ -53,7 +53,8 @@ def test_text_has_the_commands_once():
     ("cell", "is_numeric"),
     [
         ("-", True), ("missing", True), ("1544.75", True), ("84/100", True), ("+15 [+1.0, +29.5]", True),
-        ("1.76× [1.50×, 2.10×]", True), ("15.0-85.0%", True), ("<0.001", True), ("1.25 [too few]", True), ("+2.0 [too few] points", True),
+        ("1.76× [1.50×, 2.10×]", True), ("15.0-85.0%", True), ("<0.001", True),
+        ("1.25 [too few]", True), ("+2.0 [too few] points", True),
         ("socket_l1", False), ("1 of 2", False),
     ],
 )  # fmt: skip
