@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: folders beside the package travel inside it in a wheel (see imfvla/assets.py)."""
+"""What pyproject.toml cannot say: folders beside the package travel inside it in a wheel (imfvla/config/assets.py)."""
 
 from setuptools import find_packages, setup
 

@@ -24,13 +24,13 @@ from imfvla.benchmarks.tables import (
     speed_table,
     training_rows,
 )
-from imfvla.composition import CONFIG_DIRECTORY, compose
-from imfvla.entry import entry_point
-from imfvla.fingerprint import fingerprint
+from imfvla.command.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.entry import entry_point
 from imfvla.options import at_least, build, one_of, require, some, within
-from imfvla.progress import Progress
+from imfvla.process.progress import Progress
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.table import Table, number
+from imfvla.storage.fingerprint import fingerprint
 
 PARTS = ("sizes", "simulation", "training", "latency")
 SCALES = ("cpu", "paper")
@@ -133,9 +133,9 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
     from imfvla.benchmarks.latency import measure_latency
     from imfvla.benchmarks.simulation import measure_demonstrations, measure_simulation
     from imfvla.benchmarks.training import measure_training
+    from imfvla.command.rehearsal import build_unfitted
     from imfvla.environments import environment_of
     from imfvla.policy import build_policy
-    from imfvla.rehearsal import build_unfitted
     from imfvla.sources.mcap import McapSource
     from imfvla.training.data import prepare_windows
 

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from imfvla.composition import key_of
-from imfvla.entry import entry_point
+from imfvla.command.composition import key_of
+from imfvla.command.entry import entry_point
 
 # Of an experiment's config, which a training would write a run directory for.
 NOTHING_WRITTEN = ("hydra/output=plain", "hydra/job_logging=plain")
@@ -40,7 +40,7 @@ def _collect(
     task: Mapping[str, Any], observation: Mapping[str, Any], demos: Mapping[str, Any], where: str
 ) -> None:
     # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.collection import collect
+    from imfvla.sources.collection import collect
 
     report = collect(task, observation, demos, where)
     found = report.recordings

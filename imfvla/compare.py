@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.command_line import quoted
-from imfvla.entry import entry_point
+from imfvla.command.entry import entry_point
+from imfvla.command.line import quoted
 from imfvla.errors import UserError
 from imfvla.evaluate import read_nfe
 from imfvla.options import build
@@ -33,9 +33,9 @@ def _compare(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.figures.style import render
     from imfvla.figures.two_runs import two_runs
-    from imfvla.files import write_together
     from imfvla.reporting.two_runs import compare_runs, table_of, verdict
-    from imfvla.run_directory import RunDirectory
+    from imfvla.storage.files import write_together
+    from imfvla.storage.run_directory import RunDirectory
 
     build(CompareOptions, config, "")
     if len(config["runs"]) != 2:

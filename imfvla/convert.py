@@ -7,7 +7,7 @@ if __name__ == "__main__":
 
 from typing import Any
 
-from imfvla.entry import entry_point
+from imfvla.command.entry import entry_point
 
 USAGE = (
     "Choose a source and a target, such as python -m imfvla.convert from=lerobot from.path=FOLDER to=mcap "
@@ -19,7 +19,7 @@ USAGE = (
 @entry_point("convert", usage=lambda: USAGE)
 def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.conversion import convert
+    from imfvla.sources.conversion import convert
 
     done = convert(config["from"], config["to"])
     repeats = f", the picture of an earlier step at {done.num_repeats} of them" if done.num_repeats else ""

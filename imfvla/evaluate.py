@@ -7,19 +7,19 @@ if __name__ == "__main__":
 
 from typing import Any
 
-from imfvla.entry import entry_point
+from imfvla.command.entry import entry_point
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.options import build, is_whole, require
-from imfvla.protocol import EvaluationOptions
 from imfvla.robot_of import has_environment
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 
 @entry_point("evaluate")
 def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.evaluation import evaluate
     from imfvla.reporting.table_row import print_row
+    from imfvla.rollouts.evaluation import evaluate
 
     require(config["run"] is None or isinstance(config["run"], str), "run", "a directory", config["run"])
     if not config["run"]:
@@ -28,8 +28,8 @@ def main(config: dict[str, Any]) -> None:
     options = build(EvaluationOptions, wanted, "")
     run = RunDirectory(config["run"])
     if not has_environment(trained := run.config()):
-        from imfvla.offline import evaluate_offline
         from imfvla.reporting.offline import print_offline
+        from imfvla.rollouts.offline import evaluate_offline
 
         evaluate_offline(run, trained, options)
         print_offline(run)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from imfvla.entry import entry_point
+from imfvla.command.entry import entry_point
 from imfvla.episode import Actor
-from imfvla.files import write_together
 from imfvla.options import build, within
+from imfvla.storage.files import write_together
 
 if TYPE_CHECKING:
     from imfvla.tasks.bimanual_environment import BimanualEnvironment

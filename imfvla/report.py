@@ -11,11 +11,11 @@ from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 
-from imfvla.composition import compose
-from imfvla.entry import entry_point
+from imfvla.command.composition import compose
+from imfvla.command.entry import entry_point
 from imfvla.options import build
 from imfvla.robot_of import has_environment
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def main(config: dict[str, Any]) -> None:
             print_offline(run)
         return
     # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.publication import publish
+    from imfvla.command.publication import publish
     from imfvla.reporting.mapping import PATH, read_mapping
 
     mapping = read_mapping(Path(options.mapping) if options.mapping else PATH)

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
+from imfvla.config.views import ViewOptions
 from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.options import build, part_of
 from imfvla.robot import RobotSpec
-from imfvla.views import ViewOptions
 
 KEY = "robot"  # of a run's config, its checkpoints' description and a task's YAML
 NO_ENVIRONMENT = "none"  # as task.name: the run trains on data and is judged on data

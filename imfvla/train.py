@@ -10,10 +10,10 @@ if __name__ == "__main__":
 
 from typing import Any
 
-from imfvla.completion import is_complete
-from imfvla.composition import CONFIG_DIRECTORY
-from imfvla.entry import entry_point, output_directory
-from imfvla.run_directory import RunDirectory
+from imfvla.command.completion import is_complete
+from imfvla.command.composition import CONFIG_DIRECTORY
+from imfvla.command.entry import entry_point, output_directory
+from imfvla.storage.run_directory import RunDirectory
 
 
 def usage() -> str:
@@ -28,7 +28,7 @@ def usage() -> str:
 @entry_point("train", is_complete, usage)
 def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.experiment import run_experiment
+    from imfvla.command.experiment import run_experiment
 
     run_experiment(config, RunDirectory(output_directory()))
 

@@ -8,8 +8,8 @@ import torch
 from synthetic import StillScene
 from torch import Tensor
 
+from imfvla.config.horizon import Horizon
 from imfvla.environment import Outcome
-from imfvla.horizon import Horizon
 from imfvla.robot import Camera, RobotSpec
 from imfvla.types import Observation
 

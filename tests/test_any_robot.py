@@ -5,12 +5,12 @@ import pytest
 import torch
 from any_robot import SENTENCE, MemorySource, names_of, robot_of_size
 
-from imfvla.actor import ChunkActor
-from imfvla.composition import compose
-from imfvla.experiment import run_experiment
+from imfvla.command.composition import compose
+from imfvla.command.experiment import run_experiment
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import robot_of
-from imfvla.run_directory import DONE, RunDirectory
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.storage.run_directory import DONE, RunDirectory
 from imfvla.training.checkpoint import load_policy
 
 SHAPES = ((7, 7), (8, 9), (14, 14), (20, 23))  # actions, states

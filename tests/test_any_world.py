@@ -11,13 +11,12 @@ import yaml
 from fakes import KnownPolicy, PlainEnvironment, fake_robot, known_actions
 from mcap.reader import make_reader
 
-from imfvla import workbench
+from imfvla.config.horizon import Horizon
+from imfvla.config.protocol import EvaluationOptions
+from imfvla.environments.rollout import SIMULATION_ENDED, run_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.evaluation import evaluate
 from imfvla.figures.panels import stages_of, tasks_of
-from imfvla.horizon import Horizon
-from imfvla.protocol import EvaluationOptions
 from imfvla.recording import McapSink, VideoSink, read_episode, read_index
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.mapping import PATH, read_mapping
@@ -26,8 +25,9 @@ from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import table_of
 from imfvla.reporting.tables import other_table, row_table
 from imfvla.robot import Camera, RobotSpec
-from imfvla.rollout import SIMULATION_ENDED, run_episode
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts import workbench
+from imfvla.rollouts.evaluation import evaluate
+from imfvla.storage.run_directory import RunDirectory
 
 ONE = (Camera("wrist", 12, 20),)
 FOUR = (Camera("high", 16, 24), Camera("low", 12, 12), Camera("left_eye", 8, 30), Camera("right_eye", 20, 10))

@@ -13,8 +13,8 @@ from imfvla.benchmarks.latency import measure_latency
 from imfvla.benchmarks.sizes import measure_size
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP as PARTS
 from imfvla.benchmarks.tables import latency_table, speed_ratios
-from imfvla.composition import compose
-from imfvla.rehearsal import build_unfitted
+from imfvla.command.composition import compose
+from imfvla.command.rehearsal import build_unfitted
 from imfvla.reporting.mapping import read_mapping
 
 TOY = (

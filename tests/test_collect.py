@@ -2,8 +2,9 @@
 
 import pytest
 
-from imfvla import collect, collection
+from imfvla import collect
 from imfvla.recording import Recordings
+from imfvla.sources import collection
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from imfvla.compare import main
 from imfvla.errors import UserError
 from imfvla.figures.two_runs import counts, two_runs
 from imfvla.reporting.two_runs import compare_runs, table_of, verdict
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 
 @pytest.fixture

@@ -9,18 +9,18 @@ import torch
 from any_robot import MemorySource
 from synthetic import write_demonstrations
 
-from imfvla.composition import CONFIG_DIRECTORY, compose
-from imfvla.construction import construct
+from imfvla.command.composition import CONFIG_DIRECTORY, compose
+from imfvla.config.construction import construct
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
-from imfvla.evaluation import evaluate
 from imfvla.nn.residual import AttentionResidual
 from imfvla.options import build
 from imfvla.policy import build_policy
-from imfvla.protocol import EvaluationOptions
 from imfvla.reporting.mapping import read_mapping
 from imfvla.robot_of import robot_of
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.evaluation import evaluate
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer

@@ -12,14 +12,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from synthetic import write_episode
 
-from imfvla.composition import compose
-from imfvla.construction import allowed_class, construct
+from imfvla.command.composition import compose
+from imfvla.command.experiment import run_experiment
+from imfvla.config.construction import allowed_class, construct
 from imfvla.errors import UserError
-from imfvla.experiment import run_experiment
 from imfvla.policy import build_policy
 from imfvla.recording import McapSink, read_episode
-from imfvla.run_directory import RunDirectory
-from imfvla.run_names import run_name
+from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.run_names import run_name
 
 ROOT = Path(__file__).resolve().parent.parent
 TREE = subprocess.run(
@@ -101,8 +101,8 @@ def test_the_fuzzer_tells_another_error_and_a_reader_that_does_not_end(fuzz, tmp
     "target",
     [
         "os.system",
-        "imfvla.files.os.system",
-        "imfvla.files.write_text",
+        "imfvla.storage.files.os.system",
+        "imfvla.storage.files.write_text",
         "imfvla.encoders.vision.torch.load",
         "imfvla.nn.pretrained.load_file",
         "imfvla.nn.residual.nn.Module",
@@ -157,7 +157,7 @@ def test_a_run_directory_of_a_stranger_runs_nothing(tmp_path):
     """The config is read and refused; what it names is never called."""
     run = RunDirectory(tmp_path / "run")
     config = compose("train", ["+exp=socket_ph32_exec16"])
-    config["generator"] = {"_target_": "imfvla.files.os.system", "command": f"touch {tmp_path}/owned"}
+    config["generator"] = {"_target_": "imfvla.storage.files.os.system", "command": f"touch {tmp_path}/owned"}
     run.claim(config)
     with pytest.raises(UserError, match=r"generator\._target_ must name a class"):
         build_policy(run.config())

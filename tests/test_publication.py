@@ -11,12 +11,12 @@ from unittest import mock
 import pytest
 from synthetic_runs import answer_row, make_run, write_evaluation
 
-from imfvla import publication
-from imfvla.composition import compose
+from imfvla.command import publication
+from imfvla.command.composition import compose
+from imfvla.command.publication import publish
 from imfvla.errors import UserError
-from imfvla.files import write_together
-from imfvla.publication import publish
 from imfvla.reporting.mapping import PATH, read_mapping
+from imfvla.storage.files import write_together
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
@@ -163,7 +163,7 @@ def test_evaluations_of_no_row_have_a_table_of_their_own(runs, tmp_path, method,
 
 def test_the_command_needs_neither_torch_nor_a_simulator(runs, tmp_path):
     check = (
-        "import sys; from imfvla import publication; from imfvla.report import main; "
+        "import sys; from imfvla.command import publication; from imfvla.report import main; "
         "publication.render = lambda figure: {'.svg': b'', '.png': b''}; main(sys.argv[1:]); "
         "assert not {'torch', 'mujoco', 'dm_control'} & set(sys.modules)"
     )

@@ -9,17 +9,16 @@ import torch
 import yaml
 from any_robot import MemorySource, robot_of_size
 
-from imfvla.actor import ChunkActor
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
-from imfvla.instruction import MAX_WORDS
 from imfvla.policy import build_policy
 from imfvla.robot_of import robot_of, with_robot
-from imfvla.run_directory import DERIVED_KEYS, EXECUTION_KEYS, RunDirectory, differences
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.storage.run_directory import DERIVED_KEYS, EXECUTION_KEYS, RunDirectory, differences
 from imfvla.tasks.bimanual_robot import bimanual_robot
 from imfvla.training.checkpoint import load_policy, load_weights
 from imfvla.training.data import refuse_other_source
-from imfvla.types import Observation
+from imfvla.types import MAX_WORDS, Observation
 
 SHIPPED = Path(__file__).resolve().parent.parent / "experiments" / "pretrained"
 RESULTS = SHIPPED.parent / "results"

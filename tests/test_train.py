@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from imfvla.experiment import Trainer
-from imfvla.run_directory import DONE, FAILED, RunDirectory
+from imfvla.command.experiment import Trainer
+from imfvla.storage.run_directory import DONE, FAILED, RunDirectory
 from imfvla.train import main
 from imfvla.training.logger import read_metrics
 

@@ -15,8 +15,8 @@ BESIDE = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "experiments/tab
 COMPOSE = """
 import json
 import imfvla
-from imfvla.assets import install_command
-from imfvla.composition import compose
+from imfvla.config.assets import install_command
+from imfvla.command.composition import compose
 from imfvla.reporting.mapping import read_mapping
 config = compose("train", ["+exp=transfer_dwell"])
 print(json.dumps([imfvla.__file__, config["name"], len(read_mapping().rows), install_command("slurm")]))
@@ -110,7 +110,9 @@ def test_its_results_name_no_commit_of_the_project_that_it_is_installed_in(unpac
     ]
     for arguments in (["init", "--quiet"], commit):
         subprocess.run(["git", "-C", str(unpacked.parent), *arguments], check=True)
-    script = "import json; from imfvla.fingerprint import code_version; print(json.dumps(code_version()))"
+    script = (
+        "import json; from imfvla.storage.fingerprint import code_version; print(json.dumps(code_version()))"
+    )
     version = json.loads(run(unpacked, tmp_path, "-c", script).stdout)
     assert (version["commit"], version["dirty"]) == (None, None)
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from imfvla.completion import is_complete
-from imfvla.entry import entry_point, output_directory
+from imfvla.command.completion import is_complete
+from imfvla.command.entry import entry_point, output_directory
 from imfvla.errors import UserError
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 OVERRIDES = [
     "observation.image_size=[32,32]",
@@ -51,8 +51,8 @@ def launch(arguments: list[str], directory: Path, **environment: str) -> subproc
 
 @entry_point("train", is_complete)
 def main(config: dict[str, Any]) -> None:
-    from imfvla import experiment
-    from imfvla.evaluation import evaluate
+    from imfvla.command import experiment
+    from imfvla.rollouts.evaluation import evaluate
     from imfvla.sources.mcap import McapSource
 
     if config["seed"] == 13:

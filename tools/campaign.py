@@ -28,14 +28,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
 
-from imfvla.completion import is_reported
-from imfvla.composition import register_resolvers
+from imfvla.command.completion import is_reported
+from imfvla.command.composition import register_resolvers
+from imfvla.command.sweep import Planned, planned_jobs
 from imfvla.errors import UserError
-from imfvla.progress import Progress
-from imfvla.run_directory import RunDirectory
-from imfvla.shipping import ship
-from imfvla.signals import Stopped
-from imfvla.sweep import Planned, planned_jobs
+from imfvla.process.progress import Progress
+from imfvla.process.signals import Stopped
+from imfvla.reporting.shipping import ship
+from imfvla.storage.run_directory import RunDirectory
 
 RESULTS, LOGS = Path("experiments/results"), Path("runs/campaign")
 ALONG_OTHERS = ("training.threads=1", "evaluation.workers=1")

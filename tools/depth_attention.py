@@ -14,10 +14,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from imfvla.depth_attention import measure_depth_attention
-from imfvla.files import write_json
-from imfvla.run_directory import RunDirectory
-from imfvla.workbench import load_workbench
+from imfvla.rollouts.depth_attention import measure_depth_attention
+from imfvla.rollouts.workbench import load_workbench
+from imfvla.storage.files import write_json
+from imfvla.storage.run_directory import RunDirectory
 
 SELECTION_FIRST_SEED = 10_000
 FILE = "depth_attention.json"

@@ -35,8 +35,8 @@ from importlib import metadata
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # works before the package is installed, and then says what is missing
 
-from imfvla import gl  # noqa: E402
 from imfvla.errors import UserError  # noqa: E402
+from imfvla.process import gl  # noqa: E402
 
 MIN_PYTHON = (3, 11)
 MIN_FREE_GB = 5.0  # demonstrations, frame store and one run of a task
@@ -78,7 +78,7 @@ def check_python() -> Finding:
 
 def check_machine() -> Finding:
     """CPU model, the flags that matter for speed, cores and memory."""
-    from imfvla.fingerprint import machine
+    from imfvla.storage.fingerprint import machine
 
     found = machine()
     flags = " ".join(found["cpu_flags"]) or "no fast vector flags"
@@ -92,7 +92,7 @@ def check_threads() -> Finding:
     """How many threads torch would use; more threads than cores make small matrices far slower."""
     import torch
 
-    from imfvla.fingerprint import physical_cores
+    from imfvla.storage.fingerprint import physical_cores
 
     cores = physical_cores()
     setting = os.environ.get("OMP_NUM_THREADS", "unset")

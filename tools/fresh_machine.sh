@@ -3,7 +3,7 @@
 #
 #     tools/fresh_machine.sh                      # needs root, and debootstrap: apt-get install debootstrap
 #     tools/fresh_machine.sh --user               # as a user who may not install packages
-#     tools/fresh_machine.sh --suite trixie --test "tests/test_gl.py"
+#     tools/fresh_machine.sh --suite trixie --test "tests/process/test_gl.py"
 #
 # The root takes over this machine's mirror and proxy of apt, its own certificates, and its settings of pip.
 set -euo pipefail

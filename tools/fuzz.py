@@ -39,21 +39,21 @@ from mcap.records import Attachment, Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.command.rehearsal import read_options, rehearse
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
-from imfvla.files import write_json
 from imfvla.nn.pretrained import read_weights
 from imfvla.recording import read_episode, read_index
-from imfvla.rehearsal import read_options, rehearse
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.runs import evaluations
-from imfvla.rollout_log import PARTIAL, RolloutLog
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.files import write_json
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, load_weights, save_state, save_weights
 from imfvla.training.logger import read_metrics
 
@@ -77,7 +77,7 @@ TEXTS = (
     "../../../../tmp/escaped",
     "/etc/passwd",
     "${oc.env:HOME}",
-    "imfvla.files.os.system",
+    "imfvla.storage.files.os.system",
     "\0",
     "x" * 5000,
     "",

@@ -18,13 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.actor import ChunkActor
+from imfvla.environments.rollout import run_episode
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.modes.grippers import grippers_of, release_delay
-from imfvla.progress import Progress
-from imfvla.rollout import run_episode
-from imfvla.run_directory import RunDirectory
-from imfvla.workbench import load_workbench
+from imfvla.process.progress import Progress
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.workbench import load_workbench
+from imfvla.storage.run_directory import RunDirectory
 
 
 class ActionLog:

@@ -5,7 +5,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 python=${1:-.venv/bin/python}
-ask() { "$python" -c "import sys; sys.path.insert(0, '.'); from imfvla import gl; print($1)"; }
+ask() { "$python" -c "import sys; sys.path.insert(0, '.'); from imfvla.process import gl; print($1)"; }
 renders() { "$python" tools/doctor.py --only gl > /dev/null; }
 
 give_up() {

@@ -65,7 +65,7 @@ def prepare(episodes: int, folder: Path) -> tuple[dict[str, Any], Drawn, dict[st
     """The config of a training, the episodes, and the time that importing what it needs took."""
     parts: dict[str, float] = {}
     with timed(parts, "imports"):
-        from imfvla.composition import compose
+        from imfvla.command.composition import compose
         from imfvla.robot_of import robot_of
         from imfvla.training.loop import Trainer  # noqa: F401, a training imports it
     pictures = ["observation.views=[front]", f"observation.image_size={list(SIZE)}"]

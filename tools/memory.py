@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import psutil
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.options import build
 from imfvla.policy import build_policy
-from imfvla.run_directory import RunDirectory
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions

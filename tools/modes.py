@@ -18,10 +18,10 @@ from pathlib import Path
 
 import torch
 
+from imfvla.config.protocol import SELECTION_FIRST_SEED
 from imfvla.errors import UserError
 from imfvla.figures.modes import modes_figure
 from imfvla.figures.style import render
-from imfvla.files import write_json, write_together
 from imfvla.modes.grippers import grippers_of
 from imfvla.modes.observations import Stops
 from imfvla.modes.recordings import (
@@ -31,9 +31,9 @@ from imfvla.modes.recordings import (
     settings_of,
 )
 from imfvla.modes.report import measure, modes_table
-from imfvla.progress import Progress
-from imfvla.protocol import SELECTION_FIRST_SEED
-from imfvla.run_directory import RunDirectory
+from imfvla.process.progress import Progress
+from imfvla.storage.files import write_json, write_together
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
 
 

@@ -21,20 +21,20 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from imfvla.actor import ChunkActor
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.command.publication import publish
 from imfvla.environment import Environment
+from imfvla.environments.rollout import run_episode
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.figures.contact_sheet import contact_sheet, png
-from imfvla.files import write_together
 from imfvla.gallery import write_gallery
-from imfvla.publication import publish
 from imfvla.reporting.mapping import read_mapping
-from imfvla.rollout import run_episode
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.workbench import load_workbench
+from imfvla.storage.files import write_together
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.tasks.bimanual_robot import CONTROL_HZ, TIME_LIMIT_STEPS
-from imfvla.workbench import load_workbench
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS, SHIPPED = ROOT / "experiments" / "results", ROOT / "experiments" / "pretrained"

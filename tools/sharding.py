@@ -28,20 +28,19 @@ import psutil
 import torch
 from torch import Tensor
 
-from imfvla.composition import compose
-from imfvla.instruction import MAX_WORDS
+from imfvla.command.composition import compose
+from imfvla.data.statistics import Statistics
 from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.robot_of import robot_of
-from imfvla.run_directory import RunDirectory
-from imfvla.statistics import Statistics
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import save_state
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import joined_processes
 from imfvla.training.sharding import SHARDINGS
-from imfvla.types import Batch, Observation
+from imfvla.types import MAX_WORDS, Batch, Observation
 
 STEPS = 2
 TOLERANCE = 1e-4  # of the loss

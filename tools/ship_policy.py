@@ -18,8 +18,8 @@ import json
 import sys
 from pathlib import Path
 
-from imfvla.run_directory import RunDirectory
-from imfvla.shipping import ship
+from imfvla.reporting.shipping import ship
+from imfvla.storage.run_directory import RunDirectory
 
 
 @as_command

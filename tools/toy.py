@@ -23,9 +23,9 @@ import torch
 from imfvla.benchmarks.toy import GENERATORS, draw, run_cases
 from imfvla.figures.style import render
 from imfvla.figures.toy import toy_figure
-from imfvla.files import write_json, write_together
-from imfvla.fingerprint import fingerprint
-from imfvla.progress import Progress
+from imfvla.process.progress import Progress
+from imfvla.storage.files import write_json, write_together
+from imfvla.storage.fingerprint import fingerprint
 
 SHOWN = 3000  # samples in a panel
 

@@ -5,15 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from imfvla.actor import ChunkActor
 from imfvla.benchmarks.clock import threads, times_ms
 from imfvla.benchmarks.sizes import core_inputs
+from imfvla.data.resample import resample
 from imfvla.environment import Environment
-from imfvla.instruction import tokenize
 from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
-from imfvla.resample import resample
-from imfvla.types import Observation
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.types import Observation, tokenize
 
 FEWEST_CALLS = 50  # of a sampler with many steps
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from imfvla.benchmarks.clock import rate, times_ms
-from imfvla.collection import collect
 from imfvla.environment import Environment, bodies_of
 from imfvla.recording import Recordings
+from imfvla.sources.collection import collect
 
 MEASURE_S = 1.0  # seconds of each rate
 FRAMES = 50  # rendered per view

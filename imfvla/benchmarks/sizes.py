@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from imfvla.benchmarks.flops import count_flops, training_flops
+from imfvla.command.rehearsal import blank_observation, build_unfitted
 from imfvla.policy import Policy
-from imfvla.rehearsal import blank_observation, build_unfitted
 from imfvla.types import Batch, Observation
 
 

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.composition import compose
-from imfvla.construction import construct
+from imfvla.command.composition import compose
+from imfvla.config.construction import construct
 from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.linear import Linear
 from imfvla.nn.transformer import copy_weights

@@ -14,8 +14,8 @@ from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.options import build
 from imfvla.policy import Policy
-from imfvla.run_directory import RunDirectory
 from imfvla.sources.base import EpisodeSource
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
 from imfvla.training.loop import Trainer
 from imfvla.training.options import OptimOptions, TrainingOptions

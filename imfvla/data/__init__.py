@@ -4,7 +4,7 @@ from imfvla.data.augment import Augmentation
 from imfvla.data.frame_store import FrameStore
 from imfvla.data.loader import Loader
 from imfvla.data.sampler import ResumableSampler
+from imfvla.data.statistics import Statistics
 from imfvla.data.windows import Windows
-from imfvla.statistics import Statistics
 
 __all__ = ["Augmentation", "FrameStore", "Loader", "ResumableSampler", "Statistics", "Windows"]

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.documents import read_json
+from imfvla.data.resample import resample
 from imfvla.errors import UserError
-from imfvla.files import locked, write_remedy
-from imfvla.resample import resample
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
 from imfvla.sources.validation import check_episode
+from imfvla.storage.documents import read_json
+from imfvla.storage.files import locked, write_remedy
 
 FORMAT = 2
 IMAGES = "images.raw"

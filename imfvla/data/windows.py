@@ -8,13 +8,12 @@ from collections.abc import Collection
 import numpy as np
 import torch
 
+from imfvla.config.horizon import Horizon
 from imfvla.data.frame_store import FrameStore
+from imfvla.data.statistics import RunningStatistics, Statistics
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
-from imfvla.instruction import tokenize
 from imfvla.robot import RobotSpec
-from imfvla.statistics import RunningStatistics, Statistics
-from imfvla.types import Batch, Observation
+from imfvla.types import Batch, Observation, tokenize
 
 
 class Windows:

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.encoders.vision import in_unit_range
-from imfvla.instruction import NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
-from imfvla.types import Observation
+from imfvla.types import NUM_WORD_IDS, Observation
 
 MIN_STATE_SCALE = 5e-3  # in the unit of the channel: rad, m, a share of an opening
 

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.encoders.vision import in_unit_range
-from imfvla.instruction import MAX_WORDS, NUM_WORD_IDS
 from imfvla.nn.normaliser import Normaliser
 from imfvla.nn.pretrained import Backbone
-from imfvla.types import Observation
+from imfvla.types import MAX_WORDS, NUM_WORD_IDS, Observation
 
 MIN_STATE_SCALE = 5e-3  # in the unit of the channel: rad, m, a share of an opening
 

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
-from imfvla.documents import MAX_JSON_BYTES, parse_json, read_text
 from imfvla.errors import UserError
 from imfvla.figures.description import TWO_SUBLAYERS, sublayers_of
 from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
+from imfvla.storage.documents import MAX_JSON_BYTES, parse_json, read_text
 
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
 COLUMNS = 2

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from imfvla.visible import visible
+from imfvla.process.visible import visible
 
 # Okabe and Ito's colours, told apart with every common kind of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"

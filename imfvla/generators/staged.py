@@ -84,9 +84,20 @@ class StagedMeanFlow(AverageVelocity):
         return total / self.path_steps
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
-        """A chunk (B, H, A): one step of u; more of them too, or of v where u has learned the whole interval alone."""
-        takes_average = nfe == 1 or self.boundary_share < 1
-        return super().sample(core if takes_average else self.instant_core(core), context, noise, nfe)
+        """A chunk (B, H, A) in `nfe` equal steps: the first along u(z, 0, 1), so straight towards where the flow ends,
+        the others along v. Weights that have no u yet take all of them along v; where u has learned parts of the
+        interval too (`boundary_share` below 1), u takes all.
+        """
+        instant = self.instant_core(core)
+        if self.learns_average is False:
+            return super().sample(instant, context, noise, nfe)
+        if self.boundary_share < 1:
+            return super().sample(core, context, noise, nfe)
+        self.check_nfe(nfe)
+        start, end = torch.ones(len(noise)).to(noise), torch.zeros(len(noise)).to(noise)
+        z = noise - self.velocity(core, noise, end, start, context) / nfe
+        rest = torch.linspace(1, 0, nfe + 1)[1:]
+        return self.follow(instant, context, z, rest).clamp(-self.clip, self.clip)
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator

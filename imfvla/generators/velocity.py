@@ -15,6 +15,8 @@ from imfvla.generators.base import TimeSampler, refuse_nfe
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
 
+Core = Callable[[Tensor, Tensor, Tensor, Any], Tensor]  # (z, t, r, context) -> (B, H, A)
+
 MIN_TIME = 0.02  # of training in the data form u = (z - D) / t, whose error grows without bound towards t = 0
 
 
@@ -58,7 +60,7 @@ class LinearPath:
         self.draws = draws
         self.clip = clip
 
-    def velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
+    def velocity(self, core: Core, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
         """u(z, r, t): z (B, H, A), r and t > 0 (B,) -> (B, H, A)."""
         output = core(z, t, r, context)
         if self.parametrisation == "velocity":
@@ -98,14 +100,16 @@ class LinearPath:
             raise refuse_nfe("at least 1", nfe)
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
-        """z_r = z_t - (t - r) u(z_t, r, t) over `nfe` equal intervals from t = 1 to 0."""
+        """A chunk (B, H, A) in `nfe` equal steps from t = 1 to 0."""
         self.check_nfe(nfe)
-        times = torch.linspace(1, 0, nfe + 1).to(noise)
-        z = noise
-        for t, r in pairwise(times):
+        return self.follow(core, context, noise, torch.linspace(1, 0, nfe + 1)).clamp(-self.clip, self.clip)
+
+    def follow(self, core: Core, context: Any, z: Tensor, times: Tensor) -> Tensor:
+        """z_r = z_t - (t - r) u(z_t, r, t) from each of `times` (K,) to the next: z (B, H, A) at the last of them."""
+        for t, r in pairwise(times.to(z)):
             ts, rs = t.expand(len(z)), r.expand(len(z))
             z = z - (t - r) * self.velocity(core, z, rs, ts, context)
-        return z.clamp(-self.clip, self.clip)
+        return z
 
 
 class AverageVelocity(LinearPath):
@@ -137,7 +141,7 @@ class AverageVelocity(LinearPath):
         """v(z, t), of blocks of its own where the core has them, else u(z, t, t): z (B, H, A), t (B,) -> (B, H, A)."""
         return self.velocity(self.instant_core(core), z, t, t, context)
 
-    def instant_core(self, core: nn.Module) -> Callable[[Tensor, Tensor, Tensor, Any], Tensor]:
+    def instant_core(self, core: nn.Module) -> Core:
         """What answers (z, t, r, context) as the blocks of v do, whatever r."""
         if self.core_interface == "flow":
             return lambda z, t, r, context: core(z, t, t, context)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from dm_control.mujoco import engine
 
-from imfvla.views import LARGEST
+from imfvla.config.views import LARGEST
 
 
 class AlohaCameras:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from imfvla.errors import UserError
-from imfvla.gl import select_before_simulators
 from imfvla.gymnasium_env.environment import GymnasiumEnvironment
 from imfvla.gymnasium_env.options import RENDER, GymnasiumTask, read_task
 from imfvla.gymnasium_env.packages import cameras_of, import_gymnasium, register
+from imfvla.process.gl import select_before_simulators
 
 SLACK = 1e-4  # of limits that are written with a few digits
 TRIED_SEED = 0

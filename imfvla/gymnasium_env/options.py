@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+from imfvla.config.views import ViewOptions
 from imfvla.errors import UserError
 from imfvla.options import Limit, at_least, build, convert, require
 from imfvla.robot import RobotSpec
-from imfvla.views import ViewOptions
 
 REWARD, RENDER = "reward", "render"
 OBSERVATION, INFO, CAMERA = "observation", "info", "camera"  # before a slash

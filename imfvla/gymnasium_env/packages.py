@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from imfvla.assets import install_command
+from imfvla.config.assets import install_command
 from imfvla.errors import UserError
 
 GROUPS = ("imfvla.components", "gymnasium.envs")

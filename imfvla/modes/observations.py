@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imfvla.horizon import Horizon
-from imfvla.instruction import tokenize
+from imfvla.config.horizon import Horizon
 from imfvla.modes.grippers import Event, event_of
 from imfvla.recording import Episode
+from imfvla.types import tokenize
 
 
 class Place(NamedTuple):

@@ -5,7 +5,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from imfvla.collection import (
+from imfvla.config.protocol import REPORTING_FIRST_SEED, demonstration_seeds
+from imfvla.environments import BIMANUAL, KIND, kind_of
+from imfvla.errors import UserError
+from imfvla.process.progress import Progress
+from imfvla.recording import Episode, read_episode
+from imfvla.sources.collection import (
     LATER_SETTINGS,
     LOG_NAME,
     read_settings,
@@ -14,14 +19,9 @@ from imfvla.collection import (
     recording_path,
     sizes_of,
 )
-from imfvla.demonstrations import BimanualSettings
-from imfvla.documents import read_json
-from imfvla.environments import BIMANUAL, KIND, kind_of
-from imfvla.errors import UserError
-from imfvla.files import locked
-from imfvla.progress import Progress
-from imfvla.protocol import REPORTING_FIRST_SEED, demonstration_seeds
-from imfvla.recording import Episode, read_episode
+from imfvla.sources.demonstrations import BimanualSettings
+from imfvla.storage.documents import read_json
+from imfvla.storage.files import locked
 
 MOST_FAILURES = 20  # of the expert, before it is given up
 # What a recording must share with the run. Its noise, and the time held after success, may differ.

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from mcap.records import Attachment, Channel, Message, Metadata
 
-from imfvla.documents import parse_json
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.recording import messages
@@ -17,6 +16,7 @@ from imfvla.recording.channels import Channels, Misfit
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES, clear_read_errors, records
 from imfvla.recording.pictures import decode, size_of
 from imfvla.robot import Camera
+from imfvla.storage.documents import parse_json
 
 
 @dataclass(frozen=True, slots=True)

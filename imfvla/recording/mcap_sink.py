@@ -11,11 +11,11 @@ from mcap.writer import CompressionType, Writer
 from imfvla.environment import Environment, bodies_of
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.files import write_remedy
 from imfvla.recording import messages, schemas
 from imfvla.recording.channels import Channels, numbers
 from imfvla.recording.pictures import encode
 from imfvla.recording.scene import at_time, body_names, frame_transforms, scene_update
+from imfvla.storage.files import write_remedy
 
 TRANSFORMS_HZ = 10  # of /tf messages, at most
 INFO, WARNING = 2, 3  # levels of foxglove.Log

@@ -15,10 +15,10 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from imfvla.documents import parse_json
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.robot import RobotSpec
+from imfvla.storage.documents import parse_json
 from imfvla.tasks.bimanual_robot import bimanual_robot
 
 FORMAT = "2"  # "1" had no robot, which was that of this package's own tasks

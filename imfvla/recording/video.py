@@ -12,7 +12,7 @@ import numpy as np
 from imfvla.environment import Environment
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.files import write_remedy
+from imfvla.storage.files import write_remedy
 
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
 FRAMES_HZ = 25  # of videos of faster robots, nearly

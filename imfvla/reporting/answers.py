@@ -12,8 +12,8 @@ from imfvla.reporting.episodes import REMEDY, read_episodes
 from imfvla.reporting.mapping import Mapping, TableRow, Wanted
 from imfvla.reporting.metrics import Row, summarise
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
-from imfvla.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
-from imfvla.run_names import run_name
+from imfvla.storage.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
+from imfvla.storage.run_names import run_name
 
 PROTOCOL = ("task", "variant", "noise_seed", "first_seed", "episodes", "max_steps", "device")
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
+from imfvla.storage.documents import parse_json, read_lines
 
 REMEDY = "restore or delete the file"
 

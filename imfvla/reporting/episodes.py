@@ -4,9 +4,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
 from imfvla.reporting.metrics import TIMING, Row
+from imfvla.storage.documents import parse_json, read_lines
 
 REMEDY = "restore the file or evaluate again with overwrite=true"
 SHAPE = {

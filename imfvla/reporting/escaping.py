@@ -9,7 +9,7 @@ import unicodedata
 from html import escape
 from typing import Any
 
-from imfvla.visible import visible
+from imfvla.process.visible import visible
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # the wide ones begin a formula in some languages
 GREEK = {

@@ -8,19 +8,19 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from imfvla.assets import folder
+from imfvla.config.assets import folder
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of, require, suggestion
 from imfvla.reporting.mapping_file import entries, load, named, place_of, plain
 from imfvla.reporting.paper import PaperComparison, PaperRow, paper_comparisons, paper_numbers, paper_rows
-from imfvla.run_directory import LAST, step_of
-from imfvla.run_names import run_key, run_name
+from imfvla.storage.run_directory import LAST, step_of
+from imfvla.storage.run_names import run_key, run_name
 
 PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
 ROWS, COMPARISONS = "rows", "comparisons"
-FIGURES = ("reward_latency", "ablations")  # of a table's rows
+FIGURES = ("reward_latency", "ablations", "success_by_cost")  # of a table's rows
 SECTIONS = ("evaluation", "tasks", "tables")
 PRINTED = Limit("the number of a table in experiments/paper", lambda number: number in paper_numbers())
 

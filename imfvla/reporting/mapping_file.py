@@ -5,9 +5,9 @@ from typing import Any
 
 import yaml
 
-from imfvla.documents import ChosenLoader, read_yaml
 from imfvla.errors import UserError
 from imfvla.options import suggestion
+from imfvla.storage.documents import ChosenLoader, read_yaml
 
 _LINE = "__line__"
 

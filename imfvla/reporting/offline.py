@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.documents import read_json
 from imfvla.errors import UserError
-from imfvla.files import write_text
 from imfvla.reporting.table import NOTHING, Table, number
 from imfvla.reporting.tables import Document
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.documents import read_json
+from imfvla.storage.files import write_text
+from imfvla.storage.run_directory import RunDirectory
 
 FILE = "offline.json"
 HOLD, NEAREST = "hold still", "nearest demonstration"

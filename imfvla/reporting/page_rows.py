@@ -8,7 +8,7 @@ from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.escaping import html_json, html_text
 from imfvla.reporting.media import Media
 from imfvla.reporting.results import Result
-from imfvla.run_directory import flatten
+from imfvla.storage.run_directory import flatten
 
 
 def rollouts_of(result: Result, media: Media) -> str:

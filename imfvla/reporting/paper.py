@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-from imfvla.assets import folder
+from imfvla.config.assets import folder
 
 DIRECTORY = folder("experiments") / "paper"
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.documents import read_json
+from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
-from imfvla.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.reporting.mapping import TableRow, read_mapping
-from imfvla.run_directory import RunDirectory, training_steps
-from imfvla.run_names import run_key
+from imfvla.storage.documents import read_json
+from imfvla.storage.run_directory import RunDirectory, training_steps
+from imfvla.storage.run_names import run_key
 
 REMEDY = ": evaluate again with overwrite=true"
 METRICS = (

@@ -11,6 +11,7 @@ from shutil import get_terminal_size
 from rich.console import Console
 from rich.text import Text
 
+from imfvla.process.visible import styled, visible
 from imfvla.reporting.escaping import (
     csv_cell,
     latex_cell,
@@ -21,7 +22,6 @@ from imfvla.reporting.escaping import (
 )
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.terminal import fit
-from imfvla.visible import styled, visible
 
 WIDE = 160  # characters a line where no terminal says how many it has
 NOTHING = "-"

@@ -6,12 +6,12 @@ from typing import Any
 
 from rich.console import Console
 
-from imfvla.files import write_json, write_text
 from imfvla.reporting.metrics import wilson_interval
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.runs import METRICS, Evaluation, evaluations, rows
 from imfvla.reporting.table import NOTHING, Table, number
-from imfvla.run_directory import LAST, RunDirectory
+from imfvla.storage.files import write_json, write_text
+from imfvla.storage.run_directory import LAST, RunDirectory
 
 COLUMNS = (
     "nfe", "source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "95% interval",

@@ -12,7 +12,7 @@ from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, interval, number, with_interval
 from imfvla.reporting.table_row import machine
-from imfvla.run_directory import LAST
+from imfvla.storage.run_directory import LAST
 
 COLUMNS = (
     "Row", "nfe", "Source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "Latency ms", "p95 ms",

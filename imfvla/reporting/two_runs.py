@@ -14,7 +14,7 @@ from imfvla.reporting.significance import holm
 from imfvla.reporting.table import NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.reporting.tables import COLUMNS, ours, p_value
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 NAMES = ("A", "B")
 

@@ -12,8 +12,8 @@ from imfvla.episode import EpisodeInfo
 from imfvla.errors import UserError
 from imfvla.options import Limit, build
 from imfvla.recording import EpisodeIndex, Recordings, read_episode, read_index
-from imfvla.same_robot import refuse_other_robot
 from imfvla.sources.base import EpisodeArrays
+from imfvla.sources.same_robot import refuse_other_robot
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors
+from imfvla.storage.files import clear_write_errors
 
 
 class NewFolder:

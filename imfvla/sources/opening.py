@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from imfvla.construction import construct
+from imfvla.config.construction import construct
 from imfvla.options import one_of, part_of, require
 from imfvla.sources.base import EpisodeSource
 

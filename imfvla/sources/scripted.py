@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from imfvla.collection import ensure_demonstrations
+from imfvla.sources.collection import ensure_demonstrations
 from imfvla.sources.mcap import McapSource
 
 

@@ -7,7 +7,7 @@ robot need no simulator; `load` imports it.
 from typing import TYPE_CHECKING
 
 from imfvla.errors import UserError
-from imfvla.gl import select_before_simulators
+from imfvla.process.gl import select_before_simulators
 from imfvla.tasks.bimanual_robot import ALL_VIEWS, TIME_LIMIT_STEPS, bimanual_robot
 from imfvla.tasks.catalogue import NAMES, class_at, entry_of, text_for
 

@@ -6,6 +6,7 @@ import numpy as np
 from dm_control import composer, mjcf
 from dm_control.mujoco import engine
 
+from imfvla.config.views import ViewOptions
 from imfvla.environment import Outcome
 from imfvla.errors import UserError
 from imfvla.options import build
@@ -13,7 +14,6 @@ from imfvla.tasks.bimanual import BimanualTask
 from imfvla.tasks.bimanual_robot import ALL_VIEWS, CONTROL_HZ, TIME_LIMIT_STEPS, bimanual_robot
 from imfvla.tasks.catalogue import text_for
 from imfvla.tasks.scene import CAMERAS
-from imfvla.views import ViewOptions
 
 
 class BimanualEnvironment:

@@ -3,8 +3,8 @@
 import numpy as np
 from dm_control import composer, mjcf
 
+from imfvla.config.views import LARGEST
 from imfvla.tasks.robot import TABLE_BIT, Arm, look_at
-from imfvla.views import LARGEST
 
 PHYSICS_TIMESTEP_S = 0.004
 BASE_X = 0.62  # the arms' bases stand at -x (left) and +x (right) and face each other

@@ -20,14 +20,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from imfvla.documents import parse_json, read_json
 from imfvla.errors import UserError, unreadable
-from imfvla.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
 from imfvla.policy import Policy, build_policy
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import KEY
-from imfvla.run_directory import RunDirectory
-from imfvla.same_robot import refuse_other_robot
+from imfvla.sources.same_robot import refuse_other_robot
+from imfvla.storage.documents import parse_json, read_json
+from imfvla.storage.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"

@@ -4,16 +4,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
-from imfvla.horizon import Horizon
 from imfvla.options import build
-from imfvla.progress import Progress
+from imfvla.process.progress import Progress
 from imfvla.robot_of import robot_of
-from imfvla.same_robot import refuse_other_data
 from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.opening import source_kind
+from imfvla.sources.same_robot import refuse_other_data
 
 STORES = Path("data/frames")  # of sources that are no folder of recordings
 DIGITS = 12  # of a source's digest in the name of its store

@@ -7,10 +7,10 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from imfvla.documents import parse_json, read_lines
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors, write_text
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.documents import parse_json, read_lines
+from imfvla.storage.files import clear_write_errors, write_text
+from imfvla.storage.run_directory import RunDirectory
 
 
 class MetricsLogger:

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.fingerprint import code_version, fingerprint, physical_cores
 from imfvla.nn.compiled import compile_parts
-from imfvla.progress import Progress
-from imfvla.run_directory import RunDirectory
-from imfvla.signals import Stopped, deferred_stop
+from imfvla.process.progress import Progress
+from imfvla.process.signals import Stopped, deferred_stop
+from imfvla.storage.fingerprint import code_version, fingerprint, physical_cores
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
 from imfvla.training.clipping import Clipping
 from imfvla.training.ema import Ema

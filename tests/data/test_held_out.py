@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from any_robot import MemorySource, names_of, robot_of_size
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import FrameStore, Windows
 from imfvla.data.held_out import held_out
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
 from imfvla.training.data import held_out_windows
 
 NONE = {"name": "none", "paraphrases": False}

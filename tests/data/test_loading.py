@@ -8,9 +8,9 @@ import pytest
 import torch
 from synthetic import VIEWS
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
 from imfvla.sources.mcap import McapSource
 from imfvla.tasks.bimanual_robot import bimanual_robot
 

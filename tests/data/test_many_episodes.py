@@ -7,10 +7,10 @@ import pytest
 import torch
 from any_robot import MemorySource, names_of, robot_of_size
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Statistics, Windows
-from imfvla.horizon import Horizon
-from imfvla.instruction import tokenize
-from imfvla.statistics import RunningStatistics
+from imfvla.data.statistics import RunningStatistics
+from imfvla.types import tokenize
 
 ROBOT = robot_of_size(7, 9)
 HORIZONS = [(1, 1, 1), (1, 8, 4), (2, 8, 8), (3, 40, 5)]

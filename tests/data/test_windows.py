@@ -5,12 +5,12 @@ import pytest
 import torch
 from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, StillScene, synthetic_actions, write_demonstrations
 
+from imfvla.config.horizon import Horizon
 from imfvla.data import FrameStore, Statistics, Windows
 from imfvla.errors import UserError
-from imfvla.horizon import Horizon
-from imfvla.instruction import tokenize
 from imfvla.sources.mcap import McapSource
 from imfvla.tasks.bimanual_robot import bimanual_robot
+from imfvla.types import tokenize
 
 ROBOT = bimanual_robot(VIEWS, (8, 8))
 NUM_STEPS = 21

@@ -6,8 +6,7 @@ import torch
 from imfvla.encoders.observation import ObservationEncoder
 from imfvla.encoders.tokens import AttendedTokens, GridTokens
 from imfvla.encoders.vision import CompactCNN, CompactResNet, ResNet18
-from imfvla.instruction import tokenize
-from imfvla.types import Observation
+from imfvla.types import Observation, tokenize
 
 TRUNKS = {
     "compact": lambda: CompactCNN((16, 16), 8),

@@ -2,17 +2,16 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.encoders.tokens import PatchTokens
 from imfvla.encoders.vision_language import TextEncoder
 from imfvla.errors import UserError
-from imfvla.instruction import tokenize
 from imfvla.nn.pretrained import initialise_from_pretrained
 from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions
-from imfvla.types import Batch, Observation
+from imfvla.types import Batch, Observation, tokenize
 
 SMALL = [
     "+exp=socket_smolvla",

@@ -13,6 +13,7 @@ from imfvla.figures.depth_attention import FILE, depth_attention, read_depth_att
 from imfvla.figures.evaluations import success_by_evaluations
 from imfvla.figures.failures import failed_stages, first_failed_stage
 from imfvla.figures.learning import learning_curves
+from imfvla.figures.methods import success_by_cost
 from imfvla.figures.reward_latency import errors, pareto_frontier, reward_latency
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
@@ -22,7 +23,7 @@ from imfvla.reporting.results import Result
 
 MAPPING = read_mapping()
 MISSING = ("socket_smolvla", "transfer_dit_ph08_exec08", "socket_l1")
-FIGURES = [reward_latency, ablations, success_by_evaluations, learning_curves, failed_stages]
+FIGURES = [reward_latency, ablations, success_by_evaluations, learning_curves, failed_stages, success_by_cost]
 
 
 def results_of(*directories) -> list[Result]:
@@ -48,7 +49,7 @@ def of_table(results, table: str) -> list[Result]:
 @pytest.mark.parametrize("draw", FIGURES)
 def test_no_text_is_cut_off_whether_there_are_results_or_none(draw, results, tmp_path):
     for found in (results, results_of(tmp_path)):
-        table = {reward_latency: "table1", ablations: "table2"}.get(draw)
+        table = {reward_latency: "table1", ablations: "table2", success_by_cost: "dwell"}.get(draw)
         assert not clipped(draw(of_table(found, table) if table else found))
 
 
@@ -57,6 +58,17 @@ def test_a_missing_row_is_marked_and_has_no_bar(results):
     assert texts(figure).count("missing") == 2  # in both panels
     lengths = [[bar.get_width() for bar in axes.containers[-1]] for axes in figure.axes]
     assert all(np.isnan(panel[8]) and np.isfinite(np.delete(panel, 8)).all() for panel in lengths)
+
+
+def test_costs_are_shown_for_each_method_with_its_trainings(results):
+    figure = success_by_cost(of_table(results, "dwell"))
+    calls, times = (
+        [np.array(bars[0].get_xdata(), float) for bars in axes.containers] for axes in figure.axes
+    )
+    for found in calls:
+        assert list(np.round(found / found[0])) in ([1, 2, 10], [1])
+    several = [np.round(found / found[0], 1).tolist() for found in times if len(found) == 3]
+    assert several == 4 * [[1, 1.7, 7.2]]  # two forms of iMF, flow matching, DDIM
 
 
 def test_the_frontier_is_what_nothing_beats_in_both():

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from seen import clipped, texts
 
-from imfvla.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.composition import CONFIG_DIRECTORY, compose
 from imfvla.figures.components import LEARNS, method_components
 from imfvla.figures.description import GENERATOR, describe
 from imfvla.figures.diagram import Sheet

@@ -6,7 +6,7 @@ from closed_forms import Context
 from hydra.utils import instantiate
 from torch import nn
 
-from imfvla.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.composition import CONFIG_DIRECTORY, compose
 from imfvla.errors import UserError
 from imfvla.nn.act import ActCore
 from imfvla.nn.residual import AttentionResidual

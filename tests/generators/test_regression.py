@@ -3,8 +3,8 @@ import torch
 from closed_forms import MEAN, STEPS, Context, Recorded, draw
 from torch import nn
 
-from imfvla.composition import compose
-from imfvla.construction import construct
+from imfvla.command.composition import compose
+from imfvla.config.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.regression import Regression
 

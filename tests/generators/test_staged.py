@@ -5,8 +5,8 @@ import torch
 from closed_forms import CHANNELS, MEAN, STD, STEPS, Context, GaussianFlow, columns, draw
 from torch import nn
 
-from imfvla.composition import compose
-from imfvla.construction import construct
+from imfvla.command.composition import compose
+from imfvla.config.construction import construct
 from imfvla.errors import UserError
 from imfvla.generators.base import UniformTimes
 from imfvla.generators.staged import StagedMeanFlow
@@ -147,17 +147,35 @@ def test_encoder_and_instantaneous_velocity_learn_first_and_the_average_afterwar
 
 
 @pytest.mark.parametrize("parametrisation", ["velocity", "data"])
-def test_more_steps_than_one_follow_v_where_the_average_is_of_the_whole_interval_alone(parametrisation):
-    """An average that is off by 1 everywhere shows in the one step that is taken with it."""
+def test_the_first_step_goes_along_the_average_and_the_others_along_v(parametrisation):
+    """An average that is off by 1 everywhere moves the first step's end by its length."""
     noise, _, _ = draw(8)
-    core, flow = ExactFlow(parametrisation, off=1.0), ExactFlow(parametrisation)
+    off, exact = ExactFlow(parametrisation, off=1.0), ExactFlow(parametrisation)
     whole = generator(parametrisation=parametrisation, boundary_share=1.0)
-    exact = MEAN + STD * noise
-    torch.testing.assert_close(whole.sample(core, None, noise, 1), exact - 1)
-    torch.testing.assert_close(whole.sample(core, None, noise, 400), exact, rtol=0, atol=0.02)
+    end = MEAN + STD * noise
+    torch.testing.assert_close(whole.sample(off, None, noise, 1), end - 1)
+    line = noise - (noise - end) / 4
+    by_hand = whole.follow(whole.instant_core(exact), None, line, torch.tensor([0.75, 0.5, 0.25, 0.0]))
+    torch.testing.assert_close(whole.sample(exact, None, noise, 4), by_hand)
+    torch.testing.assert_close(whole.sample(off, None, noise, 400), end, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("parametrisation", ["velocity", "data"])
+def test_all_steps_take_the_average_where_it_has_learned_parts_of_the_interval(parametrisation):
+    noise, _, _ = draw(8)
     parts = generator(parametrisation=parametrisation, boundary_share=0.9)
-    assert (parts.sample(core, None, noise, 2) - exact).abs().min() > 0.3
-    torch.testing.assert_close(parts.sample(flow, None, noise, 2), exact)
+    exact = MEAN + STD * noise
+    assert (parts.sample(ExactFlow(parametrisation, off=1.0), None, noise, 2) - exact).abs().min() > 0.3
+    torch.testing.assert_close(parts.sample(ExactFlow(parametrisation), None, noise, 2), exact)
+
+
+def test_weights_without_an_average_take_all_steps_along_v():
+    noise, _, _ = draw(8)
+    gen = generator(boundary_share=1.0)
+    gen.begin_step(Core(), 0, 2)
+    torch.testing.assert_close(
+        gen.sample(ExactFlow(off=1.0), None, noise, 2), gen.sample(ExactFlow(), None, noise, 2)
+    )
 
 
 @pytest.mark.parametrize(

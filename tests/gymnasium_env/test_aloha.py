@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("gym_aloha", reason="gym-aloha is not installed")
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.gymnasium_env import load
 from imfvla.gymnasium_env.aloha_motion import Style, Track, transfer_tracks
 from imfvla.gymnasium_env.experts import make_expert

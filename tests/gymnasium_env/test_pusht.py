@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("gym_pusht", reason="gym-pusht is not installed")
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.gymnasium_env import load
 
 

@@ -5,11 +5,11 @@ import json
 import pytest
 from synthetic import VIEWS, write_episode
 
-from imfvla.collection import LOG_NAME, recording_path
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.modes import recordings
 from imfvla.modes.recordings import choose_recordings, read_demonstration, record_starts, settings_of
+from imfvla.sources.collection import LOG_NAME, recording_path
 
 CONFIG = compose("train", ["+exp=socket_ph32_exec16", "demos.episodes=3", "observation.image_size=[32,32]"])
 

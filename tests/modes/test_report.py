@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
+from imfvla.config.horizon import Horizon
 from imfvla.errors import UserError
 from imfvla.figures.modes import modes_figure
-from imfvla.horizon import Horizon
 from imfvla.modes.grippers import grippers_of
 from imfvla.modes.observations import Stops
 from imfvla.modes.report import DEMONSTRATIONS, measure, modes_table

@@ -9,11 +9,11 @@ import torch
 from synthetic import write_demonstrations
 from test_hostile_files import load_tool
 
-from imfvla.collection import recording_path
-from imfvla.composition import compose
+from imfvla.command.composition import compose
+from imfvla.data.statistics import Statistics
 from imfvla.policy import build_policy
-from imfvla.run_directory import RunDirectory
-from imfvla.statistics import Statistics
+from imfvla.sources.collection import recording_path
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import save_weights
 
 RUN = [

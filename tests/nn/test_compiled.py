@@ -2,7 +2,7 @@ import copy
 
 import pytest
 import torch
-from test_policy import batch, config, loss, policy
+from small_policy import batch, config, loss, policy
 
 from imfvla.errors import UserError
 from imfvla.nn import compiled

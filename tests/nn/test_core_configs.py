@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from imfvla.composition import compose
-from imfvla.construction import construct
+from imfvla.command.composition import compose
+from imfvla.config.construction import construct
 from imfvla.errors import UserError
 from imfvla.policy import build_policy
 

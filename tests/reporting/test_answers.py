@@ -7,13 +7,13 @@ import pytest
 import yaml
 from synthetic_runs import STEPS, answer_row, make_run, write_evaluation
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.reporting.answers import Sources, check_equal_protocols, read_evaluated
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
 from imfvla.reporting.runs import rows
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}

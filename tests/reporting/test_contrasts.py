@@ -12,7 +12,7 @@ from imfvla.reporting.metrics import summarise
 from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.runs import evaluations
 from imfvla.reporting.significance import mcnemar, sign_flip
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 
 from imfvla.figures.style import new_figure, render, style
+from imfvla.process.visible import visible
 from imfvla.reporting.escaping import (
     csv_cell,
     html_json,
@@ -31,7 +32,6 @@ from imfvla.reporting.media import Media
 from imfvla.reporting.page import Picture, page
 from imfvla.reporting.page_rows import anchor
 from imfvla.reporting.table import Table
-from imfvla.visible import visible
 
 NAMES = {
     "escape sequence": "\x1b]0;owned\x07\x1b[31mred",

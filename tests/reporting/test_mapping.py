@@ -8,7 +8,7 @@ import pytest
 
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import PATH, read_mapping
-from imfvla.run_names import run_key, run_name
+from imfvla.storage.run_names import run_key, run_name
 
 TEXT = PATH.read_text()
 

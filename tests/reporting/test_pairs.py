@@ -11,7 +11,7 @@ from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 
 def evaluated(path: Path, **options) -> Evaluated:

@@ -13,7 +13,7 @@ from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.power import ALPHA
 from imfvla.reporting.runs import evaluations
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 PAGE = (Path(__file__).resolve().parents[2] / "experiments" / "protocol.md").read_text(encoding="utf-8")
 SECTIONS = dict(re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))

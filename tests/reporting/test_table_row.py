@@ -14,7 +14,7 @@ from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
 from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import print_row
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 
 EXPECTED = Path(__file__).with_name("table_row.md").read_text()
 

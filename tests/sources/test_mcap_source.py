@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, write_demonstrations, write_episode
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.sources import mcap, opening
 from imfvla.sources.mcap import McapSource

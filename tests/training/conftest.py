@@ -5,7 +5,7 @@ import pytest
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 from torch import nn
 
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.loop import Trainer
 
 

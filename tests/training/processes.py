@@ -16,9 +16,9 @@ import torch
 from safetensors.torch import load_file
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
-from imfvla.run_directory import RunDirectory
-from imfvla.signals import Stopped
+from imfvla.process.signals import Stopped
 from imfvla.sources.mcap import McapSource
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
@@ -74,7 +74,7 @@ def make_trainer(job: Job, processes: Alone) -> Trainer:
 
 def composed_parts(job: Job) -> tuple[Any, ...]:
     """The first arguments of a trainer, as the overrides of a job say."""
-    from imfvla.composition import compose  # here: the tiny policy starts sooner without
+    from imfvla.command.composition import compose  # here: the tiny policy starts sooner without
     from imfvla.options import build
     from imfvla.policy import build_policy
     from imfvla.training.data import make_loader, prepare_windows

@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 from tiny_policy import TinyPolicy
 
 from imfvla.errors import UserError
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training import checkpoint
 from imfvla.training.checkpoint import load_weights, read_tensors, save_weights
 

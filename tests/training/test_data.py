@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.recording import Recordings
 from imfvla.sources.mcap import McapSource

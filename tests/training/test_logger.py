@@ -3,7 +3,7 @@ import json
 import pytest
 
 from imfvla.errors import UserError
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.logger import MetricsLogger, read_metrics
 
 

@@ -19,7 +19,7 @@ from imfvla.generators.base import HighNoiseTimes
 from imfvla.generators.staged import StagedMeanFlow
 from imfvla.nn.residual import StandardResidual
 from imfvla.nn.transformer import TransformerCore
-from imfvla.signals import Stopped
+from imfvla.process.signals import Stopped
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import choose_device, step_seed
 
@@ -176,7 +176,7 @@ def test_resumes_after_sigkill(tmp_path, make_trainer):
         import os, signal, sys
         sys.path.insert(0, sys.argv[2])
         from tiny_policy import CountedBatches, OPTIM, OPTIONS, TinyPolicy
-        from imfvla.run_directory import RunDirectory
+        from imfvla.storage.run_directory import RunDirectory
         from imfvla.training.loop import Trainer
 
         class Dies(TinyPolicy):

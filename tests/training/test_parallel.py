@@ -8,7 +8,7 @@ from processes import Job, assert_close, launch, train
 from tiny_policy import OPTIONS, CountedBatches
 from torch.nn import functional as F
 
-from imfvla.composition import compose
+from imfvla.command.composition import compose
 from imfvla.errors import UserError
 from imfvla.policy import build_policy
 from imfvla.training.parallel import Alone, Shared, WholeBatchDraws, rows
@@ -72,7 +72,7 @@ def batch_of(count: int) -> Batch:
 @pytest.mark.parametrize("generator", ["imf", "meanflow", "flow", "ddpm", "l1"])
 def test_gradients_of_shares_average_to_those_of_the_batch(generator):
     """The loss with its derivative along the flow, taken twice on halves, is the loss of the whole."""
-    from imfvla.statistics import Statistics
+    from imfvla.data.statistics import Statistics
 
     torch.manual_seed(0)
     config = compose("train", ["observation.image_size=[32,32]", f"generator={generator}"])

@@ -12,7 +12,7 @@ from synthetic import write_demonstrations
 from torch import nn
 
 from imfvla.errors import UserError
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.parallel import Alone
 from imfvla.training.sharding import shard
 

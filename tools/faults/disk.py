@@ -14,7 +14,7 @@ from pathlib import Path
 from faults.killing import POLL_S, Work, ended_or_late, half_written, progress_of, start, undisturbed
 from faults.outcome import Differs, compare, state_of
 from faults.work import train
-from imfvla.run_directory import RunDirectory
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import read_tensors
 
 

@@ -12,7 +12,7 @@ from synthetic import write_demonstrations
 
 from faults.killing import kill_over, undisturbed
 from faults.outcome import Differs, compare, rows_of, state_of
-from imfvla.run_directory import DONE, RunDirectory
+from imfvla.storage.run_directory import DONE, RunDirectory
 
 
 @dataclass(frozen=True)

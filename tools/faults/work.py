@@ -8,12 +8,13 @@ import yaml
 from fakes import FakeEnvironment, build_fakes, known_actions
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
-from imfvla import collection, workbench
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.environment import Environment
 from imfvla.episode import Decision
-from imfvla.evaluation import evaluate
-from imfvla.protocol import EvaluationOptions
-from imfvla.run_directory import RunDirectory
+from imfvla.rollouts import workbench
+from imfvla.rollouts.evaluation import evaluate
+from imfvla.sources import collection
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.loop import Trainer
 
 

@@ -12,9 +12,9 @@ from fakes import build_fakes
 
 from faults.outcome import Differs, compare, rows_of
 from faults.work import roll_out
-from imfvla.evaluation import evaluate
-from imfvla.protocol import EvaluationOptions
-from imfvla.run_directory import RunDirectory
+from imfvla.config.protocol import EvaluationOptions
+from imfvla.rollouts.evaluation import evaluate
+from imfvla.storage.run_directory import RunDirectory
 
 
 def die_or_hang_once(run: Path, step: int) -> tuple[Any, Any]:

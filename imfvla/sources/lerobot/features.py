@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.options import Limit, at_least, some
 from imfvla.robot import Camera, RobotSpec, bare_name
 from imfvla.sources.checks import action_range, channels, displaced, misfit
 from imfvla.sources.lerobot.layout import DOWNLOAD, NUMERIC, ROBOT, STATS, Feature, Info
+from imfvla.storage.documents import read_json
 
 PREFIX = "observation.images."
 NAMES = some(Limit("the name of a feature", bool))

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.documents import read_json
 from imfvla.errors import UserError
 from imfvla.options import is_whole
 from imfvla.sources.checks import MAX_EPISODES, misfit, shortened
+from imfvla.storage.documents import read_json
 
 VERSION = "v3.0"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from imfvla.errors import UserError
-from imfvla.files import clear_write_errors
 from imfvla.recording.pictures import encode
 from imfvla.robot import RobotSpec
 from imfvla.sources.base import EpisodeArrays
@@ -18,6 +17,7 @@ from imfvla.sources.lerobot import layout
 from imfvla.sources.lerobot.series import DATA_MB, VIDEO_MB, Tables, Videos
 from imfvla.sources.lerobot.statistics import KEYS, Pool, of_pictures, of_samples
 from imfvla.sources.new_folder import NewFolder
+from imfvla.storage.files import clear_write_errors
 
 try:
     import pyarrow as pa

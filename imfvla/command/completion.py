@@ -1,0 +1,74 @@
+"""Whether an experiment has nothing left to do, from its files alone. Needs neither torch nor mujoco."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.reporting.offline import read_offline
+from imfvla.reporting.runs import evaluations
+from imfvla.robot_of import has_environment
+from imfvla.storage.run_directory import (
+    DONE,
+    EXECUTION_KEYS,
+    RunDirectory,
+    differences,
+    plain,
+    step_of,
+    training_steps,
+)
+
+# The keys of `evaluation` under the names that a protocol gives them.
+PROTOCOL_KEYS = (
+    "first_seed",
+    "episodes",
+    "noise_seed",
+    "noise_scale",
+    "device",
+)
+OFFLINE_KEYS = ("noise_seed", "noise_scale", "device")
+
+
+def is_complete(config: Mapping[str, Any], directory: Path) -> bool:
+    """Whether this config's run is done there, with every evaluation that the config asks for.
+
+    False where its files cannot be read: running it then reports why.
+    """
+    try:
+        step = RunDirectory(directory).weights_step(config["evaluation"]["checkpoint"])
+        return _has_evaluations(config, directory, step)
+    except (UserError, TypeError, KeyError):
+        return False
+
+
+def is_reported(config: Mapping[str, Any], directory: Path) -> bool:
+    """The same for a shipped result, which has no weights."""
+    try:
+        steps = training_steps(config, directory)
+        return _has_evaluations(config, directory, step_of(steps, config["evaluation"]["checkpoint"]))
+    except (UserError, TypeError, KeyError):
+        return False
+
+
+def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> bool:
+    run = RunDirectory(directory)
+    if run.status().get("state") != DONE:
+        return False
+    found = run.config()
+    if differences(found, plain(config), EXECUTION_KEYS):
+        return False
+    wanted = config["evaluation"]
+    if not has_environment(config):
+        offline = read_offline(run)
+        kept = {key: wanted[key] for key in OFFLINE_KEYS} | {
+            "checkpoint_step": step,
+            "nfe": list(wanted["nfe"]),
+        }
+        return offline is not None and kept.items() <= offline["protocol"].items()
+    protocol = {key: wanted[key] for key in PROTOCOL_KEYS} | {"checkpoint_step": step, "max_steps": None}
+    of_protocol = [
+        evaluation
+        for evaluation in evaluations(run, found)
+        if protocol.items() <= evaluation.summary["protocol"].items()
+    ]
+    return {*wanted["nfe"]} <= {evaluation.nfe for evaluation in of_protocol}

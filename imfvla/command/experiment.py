@@ -1,0 +1,188 @@
+"""An experiment from nothing to its row of the table: collect or open data, train, evaluate. A rerun resumes it."""
+
+import logging
+import os
+import traceback
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import torch
+
+from imfvla.command.rehearsal import read_options, rehearse
+from imfvla.config.protocol import EvaluationOptions
+from imfvla.data.held_out import held_out
+from imfvla.environments import BIMANUAL, environment_of, kind_of
+from imfvla.errors import UserError
+from imfvla.nn.pretrained import initialise_from_pretrained
+from imfvla.options import require
+from imfvla.policy import build_policy
+from imfvla.process.gl import select_gl_backend
+from imfvla.reporting.offline import print_offline
+from imfvla.reporting.table_row import print_row
+from imfvla.robot_of import has_environment, robot_of, with_robot
+from imfvla.rollouts.evaluation import evaluate
+from imfvla.rollouts.offline import evaluate_offline
+from imfvla.sources.collection import check_demonstrations
+from imfvla.sources.opening import SCRIPTED, open_source, source_kind
+from imfvla.sources.same_robot import refuse_other_robot
+from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
+from imfvla.training.loop import Trainer
+from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.parallel import Alone, joined_processes
+
+STAGES = TRAIN, EVALUATE = "train", "evaluate"
+INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
+log = logging.getLogger(__name__)
+
+
+def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
+
+    `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
+    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
+    """
+    options = read_options(config)
+    training, optim, evaluation = options.training, options.optim, options.evaluation
+    is_trained = training.steps in run.weight_steps()
+    config = with_robot(config)
+    policy = rehearse(config, evaluation.nfe, evaluation.noise_scale)
+    if not is_trained:
+        _check_source(config)
+        if not run.last_state.exists():
+            initialise_from_pretrained(policy)
+    run.refuse_links_outside()
+    if has_environment(config) and run.status().get("state") != DONE:
+        _check_environment(config)  # else training would end before an evaluation that fails
+    with joined_processes(training.device) as processes:
+        if not is_trained:
+            processes.check(training)
+        if processes.is_first:
+            _run_stages(config, run, training, optim, evaluation, processes)
+        elif processes.first_of(STAGES, TRAIN) == TRAIN:
+            _train(config, run, training, optim, processes)
+
+
+def _refuse_other_robot(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Raises UserError where the run in this directory is of another robot, which its data may have brought."""
+    refuse_other_robot(
+        robot_of(run.config()),
+        robot_of(config),
+        config["observation"]["views"],
+        of=f"the run in {run.path}",
+        where="The task or its data",
+        remedy="Choose another name=... for it.",
+    )
+
+
+def _check_environment(config: Mapping[str, Any]) -> None:
+    """Raises UserError where nothing can be drawn, or where the environment has another robot than it states."""
+    if kind_of(config["task"]) == BIMANUAL:
+        select_gl_backend()
+        return
+    env = environment_of(config)
+    refuse_other_robot(
+        robot_of(config),
+        env.robot,
+        config["observation"]["views"],
+        of="task.robot",
+        where=f"The environment {env.name}",
+        remedy="Correct task.robot.",
+    )
+    env.close()
+
+
+def _check_source(config: Mapping[str, Any]) -> None:
+    """Raises UserError where the episodes to learn from do not exist, or are of another robot; records none."""
+    if source_kind(config) == SCRIPTED:
+        require(
+            has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED
+        )
+        check_demonstrations(config)
+        return
+    source = open_source(config)
+    refuse_other_source(config, source)
+    held_out(config["task"], len(source))
+
+
+def _run_stages(
+    config: Mapping[str, Any],
+    run: RunDirectory,
+    training: TrainingOptions,
+    optim: OptimOptions,
+    evaluation: EvaluationOptions,
+    processes: Alone,
+) -> None:
+    """All stages, except the other processes' shares of training."""
+    with run.lock():
+        run.claim(config, ignored=EXECUTION_KEYS)
+        _refuse_other_robot(config, run)
+        try:
+            is_trained = training.steps in run.weight_steps()
+            processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)
+            if is_trained:
+                log.info(f"{run.path} is trained already: all {training.steps} steps are done.")
+            else:
+                _train(config, run, training, optim, processes)
+                run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
+            if has_environment(config):
+                evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+            else:
+                evaluate_offline(run, config, evaluation)
+            if run.status().get("state") != DONE:
+                run.write_status(DONE)
+        except KeyboardInterrupt:
+            run.write_status(FAILED, error="interrupted; rerun the same command to resume")
+            raise
+        except Exception as error:
+            with suppress(UserError):  # a full disk must not hide the error
+                run.write_status(FAILED, error=str(error), traceback=traceback.format_exc())
+            raise
+    if has_environment(config):
+        print_row(run)
+    else:
+        print_offline(run)
+
+
+def _train(
+    config: Mapping[str, Any],
+    run: RunDirectory,
+    training: TrainingOptions,
+    optim: OptimOptions,
+    processes: Alone,
+) -> None:
+    if processes.is_first:
+        run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
+        windows = prepare_windows(config, open_source(config))
+        run.write_status(RUNNING, phase="training", pid=os.getpid())
+        processes.wait()
+    else:
+        processes.wait()  # for demonstrations and frame store, which exist by then
+        windows = prepare_windows(config, open_source(config))
+    seed = config["seed"]
+    initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
+    torch.manual_seed(int(initial[0]))
+    policy = build_policy(config, windows.statistics())
+    if not run.last_state.exists():  # a state has the weights, and their file may be gone
+        initialise_from_pretrained(policy)
+    num_parameters = sum(parameter.numel() for parameter in policy.parameters())
+    log.info(f"{len(windows)} training items, {num_parameters / 1e6:.2f} M parameters")
+    trainer = Trainer(
+        policy,
+        make_loader(config, windows),
+        run,
+        training,
+        optim,
+        seed=seed,
+        description={
+            "name": config["name"],
+            "seed": seed,
+            "num_parameters": num_parameters,
+            "robot": robot_of(config).to_json(),
+            "config_digest": config_digest(config, EXECUTION_KEYS),
+        },
+        processes=processes,
+    )
+    trainer.train()

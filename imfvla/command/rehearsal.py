@@ -1,0 +1,118 @@
+"""Finds before the first stage what would fail later: options out of range, a policy that cannot learn."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+
+from imfvla.config.construction import reason_of
+from imfvla.config.horizon import Horizon
+from imfvla.config.protocol import MAX_SEED, USUAL_NOISE, EvaluationOptions
+from imfvla.data import Augmentation
+from imfvla.errors import UserError
+from imfvla.options import build, one_of, part_of, require, within
+from imfvla.policy import Policy, build_policy
+from imfvla.policy.chunks import FRAMES
+from imfvla.robot_of import has_environment, view_options
+from imfvla.rollouts.evaluation import require_device
+from imfvla.storage.run_directory import step_of
+from imfvla.training.loop import choose_device
+from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.types import MAX_WORDS, Batch, Observation
+
+
+@dataclass(frozen=True, slots=True)
+class Scalars:
+    """The keys of train.yaml outside of groups."""
+
+    name: str
+    seed: Annotated[int, within(0, MAX_SEED)]
+    action_frame: Annotated[str, one_of(*FRAMES)]
+
+
+@dataclass(frozen=True, slots=True)
+class ExperimentOptions:
+    """The checked groups of train.yaml that training and evaluation read."""
+
+    training: TrainingOptions
+    optim: OptimOptions
+    evaluation: EvaluationOptions
+
+
+def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
+    """The options of all stages except those of policy and demonstrations. Raises UserError on the first wrong one."""
+    build(Scalars, {name: part_of(config, name) for name in Scalars.__slots__}, "")
+    build(Horizon, part_of(config, "horizon"), "horizon")
+    build(Augmentation, part_of(config, "augmentation"), "augmentation")
+    view_options(config)
+    if not has_environment(config):
+        part_of(config, "task.held_out")
+    paraphrases = part_of(config, "task.paraphrases")
+    require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
+    training = build(TrainingOptions, part_of(config, "training"), "training")
+    optim = build(OptimOptions, part_of(config, "optim"), "optim")
+    evaluation = build(EvaluationOptions, part_of(config, "evaluation"), "evaluation")
+    choose_device(training.device)
+    require_device(evaluation.device, "evaluation.device")
+    kept = training.checkpoint_steps()
+    require(
+        step_of(training.steps, evaluation.checkpoint) in kept,
+        "evaluation.checkpoint",
+        f"one of the weights that training.steps and training.checkpoints keep, those of the steps "
+        f"{', '.join(map(str, sorted(kept)))}",
+        evaluation.checkpoint,
+    )
+    return ExperimentOptions(training, optim, evaluation)
+
+
+def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
+    """The configured policy, after the losses of its first and last step and a chunk on black pictures.
+
+    Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
+    """
+    try:
+        policy = build_unfitted(config).eval()
+        for number in nfe:
+            policy.check_sampling(number, noise_scale)
+        observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
+        valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
+        with torch.no_grad():
+            steps = config["training"]["steps"]
+            losses = []
+            for step in (0, steps - 1) if policy.has_stages else (0,):
+                policy.begin_step(step, steps)
+                rng = torch.Generator().manual_seed(0)
+                losses.append(policy.loss(Batch(observation, noise, valid), rng)[0])
+            chunk = policy.predict(observation, noise, min(nfe))
+    except UserError:
+        raise
+    except Exception as error:  # unusable arguments that a constructor accepted can raise anything
+        raise UserError(
+            "the configured policy cannot compute a loss and a chunk: correct encoder, core or generator; torch says "
+            f"{reason_of(error)!r}."
+        ) from error
+    is_finite = bool(torch.stack(losses).isfinite().all() and chunk.isfinite().all())
+    found = [float(loss) for loss in losses]
+    require(is_finite, "the first losses and chunk of encoder, core and generator", "finite", found)
+    return policy
+
+
+def build_unfitted(config: Mapping[str, Any]) -> Policy:
+    """The policy of a composed config with normalisers that change nothing: it runs, but its outputs mean nothing."""
+    policy = build_policy(config)
+    states = torch.ones(len(policy.robot.state))
+    policy.encoder.fit(-states, states)
+    chunk = torch.zeros(policy.noise_shape)
+    policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
+    return policy
+
+
+def blank_observation(policy: Policy) -> Observation:
+    """Black pictures, zeros as the state and an empty sentence, of batch 1."""
+    steps = policy.horizon.obs
+    return Observation(
+        images=torch.zeros(1, steps, len(policy.views), 3, *policy.image_size, dtype=torch.uint8),
+        state=torch.zeros(1, steps, len(policy.robot.state)),
+        instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
+    )

@@ -1,0 +1,163 @@
+"""A policy: normaliser, observation encoder, core and generator, put together from a configuration.
+
+Shapes: B batch, Tp predicted steps, A action.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from imfvla.config.construction import construct, reason_of
+from imfvla.config.horizon import Horizon
+from imfvla.config.protocol import USUAL_NOISE
+from imfvla.data.statistics import Statistics
+from imfvla.errors import UserError
+from imfvla.generators.base import Generator
+from imfvla.policy.chunks import ChunkFrame
+from imfvla.robot import RobotSpec
+from imfvla.robot_of import robot_of, view_options
+from imfvla.types import Batch, Observation
+
+
+class Policy(nn.Module):
+    """What the training loop and the evaluator know of any method: a loss and a prediction, in physical units."""
+
+    def __init__(
+        self,
+        *,
+        horizon: Horizon,
+        robot: RobotSpec,
+        views: Sequence[str],
+        image_size: tuple[int, int],
+        chunks: ChunkFrame,
+        encoder: nn.Module,
+        core: nn.Module,
+        generator: Generator,
+    ) -> None:
+        super().__init__()
+        self.horizon = horizon
+        self.robot = robot
+        self.views = tuple(views)  # cameras that it sees, in this order
+        self.image_size = tuple(image_size)  # (H, W) [px] at which it sees them
+        self.encoder = encoder
+        self.core = core
+        self.generator = generator
+        self.chunks = chunks
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(Tp, A) of the noise that one prediction starts from."""
+        return self.horizon.pred, len(self.robot.action)
+
+    @property
+    def has_stages(self) -> bool:
+        """Whether what is learned depends on the step: the generator has `span` and `begin_step`."""
+        return hasattr(self.generator, "begin_step")
+
+    def spans(self, steps: int) -> dict[str, tuple[float, float]]:
+        """Of parameters that do not learn in all of `steps` steps, the steps [first, end) in which they do, by name."""
+        if not self.has_stages:
+            return {}
+        return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
+
+    def begin_step(self, step: int, steps: int) -> None:
+        """Is told of step `step` (0-based) of `steps` before its loss, for generators whose training has stages."""
+        if self.has_stages:
+            self.generator.begin_step(self.core, step, steps)
+
+    def targets(self, batch: Batch) -> Tensor:
+        """The normalised chunks (B, Tp, A) that the generator learns, held behind an episode's end."""
+        return self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
+
+    def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
+        actions = self.targets(batch)
+        context = self.core.condition(self.encoder(batch.obs))
+        loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
+        return loss.mean(), logs
+
+    def check_sampling(self, nfe: int, noise_scale: float) -> None:
+        """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale."""
+        self.generator.check_nfe(nfe)
+        if noise_scale != USUAL_NOISE and nfe == getattr(self.generator, "ancestral_nfe", None):
+            raise UserError(
+                f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: ancestral sampling draws "
+                "noise of its own in every step, which the scale does not reach. Take fewer evaluations (DDIM)."
+            )
+
+    def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
+        """Action chunks (K B, Tp, A) in physical units from noise (K B, Tp, A) and `nfe` calls of the core.
+
+        Each observation is encoded once and serves K rows of noise that lie side by side.
+        """
+        tokens, state = self.encoder(obs), obs.state[:, -1]
+        draws = len(noise) // len(state)
+        if draws > 1:
+            tokens, state = tokens.repeat_interleave(draws, 0), state.repeat_interleave(draws, 0)
+        chunk = self.generator.sample(self.core, self.core.condition(tokens), noise, nfe)
+        return self.chunks.denormalise(chunk, state)
+
+
+def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
+    """Actions (B, Tp, A) in which steps that are not `valid` (B, Tp) repeat the last valid action before them.
+
+    They have no error of their own, but a network sees them among its noisy inputs, and a derivative passes through
+    them. What a policy does behind an episode's end is to stay where it is; zeros would be the mean of all chunks.
+    """
+    steps = torch.arange(valid.shape[1], device=valid.device)
+    last = torch.where(valid, steps, 0).cummax(dim=1).values
+    return actions.gather(1, last.unsqueeze(-1).expand_as(actions))
+
+
+def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None) -> Policy:
+    """The policy that a composed configuration describes, with the normalisers fitted where `statistics` are given.
+
+    Encoder and core are handed what robot and observation decide: the numbers of views, states and actions, and where
+    the state is among the context tokens.
+    Without statistics the normalisers are not-a-number until a checkpoint fills them. Raises UserError where the
+    parts do not fit together.
+    """
+    try:
+        horizon, robot, seen = Horizon(**config["horizon"]), robot_of(config), view_options(config)
+        chunks = ChunkFrame(config["action_frame"], horizon.pred, robot)
+        encoder = construct(config["encoder"], "encoder", views=len(seen.views), state_dim=len(robot.state))
+        policy = Policy(
+            horizon=horizon,
+            robot=robot,
+            views=seen.views,
+            image_size=seen.image_size,
+            chunks=chunks,
+            encoder=encoder,
+            core=construct(
+                config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
+            ),
+            generator=construct(config["generator"], "generator", Generator),
+        )
+    except KeyError as error:
+        raise UserError(
+            f"the configuration lacks the key {error.args[0]!r} that a policy is built from."
+        ) from None
+    except UserError:
+        raise
+    except Exception as error:  # parts that a constructor took can be unusable together
+        raise UserError(f"the configured policy cannot be built: {reason_of(error)}") from error
+    wanted, found = policy.generator.core_interface, policy.core.interface
+    if wanted != found:
+        raise UserError(
+            f"generator {config['generator']['_target_']} drives cores of the kind {wanted!r}, core "
+            f"{config['core']['_target_']} is of the kind {found!r}: core=act goes with generator=act, "
+            f"core.velocity_head=true with generator=imf or generator=imf_plain generator.v_from=head, "
+            "any other core with any other generator."
+        )
+    if policy.encoder.last_token != policy.core.last_token:
+        raise UserError(
+            f"encoder {config['encoder']['_target_']} ends its context with the {policy.encoder.last_token}, core "
+            f"{config['core']['_target_']} wants the {policy.core.last_token} there: core=smolvla goes with "
+            f"encoder=smolvla/cpu or smolvla/paper, any other core with any other encoder."
+        )
+    if statistics is not None:
+        policy.encoder.fit(torch.as_tensor(statistics.state_min), torch.as_tensor(statistics.state_max))
+        policy.chunks.fit(statistics)
+    return policy

@@ -1,0 +1,85 @@
+"""What is kept of a finished run: a policy that others can evaluate, or a result without its weights."""
+
+import re
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from imfvla.errors import UserError
+from imfvla.reporting.runs import evaluations
+from imfvla.storage.documents import read_json
+from imfvla.storage.files import clear_write_errors, copy_file, write_json, write_text
+from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
+
+MAX_BYTES = 8_000_000  # of the weights
+THINNING = 10
+RECORDED = ("depth_attention.json",)  # what tools may have added to a run
+
+
+def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str, object]:
+    """Makes `target`, which must not exist yet, whole or not at all, and returns the content of made_by.json.
+
+    It gets config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
+    summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
+    weights above 8 MB, no reported evaluation, or a target that exists.
+    """
+    if target.exists():
+        raise UserError(f"{target} exists already: remove it first.")
+    state = run.status().get("state")
+    if state != DONE:
+        raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
+    weights = run.policy_weights(LAST)
+    size = weights.stat().st_size
+    if with_weights and size > MAX_BYTES:
+        raise UserError(f"{weights} has {size} bytes: wanted at most {MAX_BYTES}; train a narrower core.")
+    reported = [evaluation for evaluation in evaluations(run) if evaluation.is_reporting]
+    if not reported:
+        raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
+    made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
+    recorded = [run.path / name for name in RECORDED if (run.path / name).exists()]
+    copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
+    copied += sorted(weights.parent.iterdir()) if with_weights else []
+    copied += [one.folder / name for one in reported for name in ("episodes.jsonl", "summary.json")]
+    rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
+    part = target.with_name(f".{target.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        for source in copied:
+            copy_file(source, part / source.relative_to(run.path))
+        write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
+        write_json(part / "made_by.json", made_by)
+        with clear_write_errors(target):
+            part.rename(target)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return made_by
+
+
+def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
+    """The command that made a run, from the name of its directory and, where the name lost brackets, its config."""
+    values = flatten(config)
+    name = "" if run.path.name == "default" else run.path.name
+    overrides = []
+    for text in re.split(r",(?=[\w./@-]+=)", name) if name else []:
+        key = text.partition("=")[0]
+        value = values.get(key)
+        overrides.append(f"{key}=[{','.join(map(str, value))}]" if isinstance(value, list) else text)
+    return shlex.join(["python", "-m", "imfvla.train", f"+exp={config['name']}", *overrides])
+
+
+def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
+    """Command, commit, seed and results of a run."""
+    config = run.config()
+    made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
+    shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
+    return {
+        "command": command_of(run, config),
+        "seed": config["seed"],
+        "code": made["fingerprint"]["code"],
+        "steps": made["step"],
+        "train_s": made["train_s"],
+        "machine": made["fingerprint"]["machine"],
+        "results": {s["name"]: {key: s[key] for key in shown} for s in summaries},
+    }

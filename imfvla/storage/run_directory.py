@@ -1,0 +1,246 @@
+"""The run directory: the contract between training, evaluation and tables. Needs neither torch nor mujoco.
+
+config.yaml  status.json  train.log  metrics.jsonl  tensorboard/
+checkpoints/last/state.safetensors            to resume from, bit for bit
+checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
+rollouts/<evaluation>/
+"""
+
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from imfvla.config.protocol import CHECKPOINT, LAST
+from imfvla.errors import UserError
+from imfvla.options import require
+from imfvla.storage.documents import read_json, read_yaml
+from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
+
+RUNNING, DONE, FAILED = "running", "done", "failed"
+# Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
+EXECUTION_KEYS = (
+    "evaluation",
+    "demos.workers",
+    "demos.directory",
+    "demos.frames_directory",
+    "training.threads",
+    "training.compile",
+    "training.sharding",
+    "training.on_non_finite",
+    "training.prefetch",
+    "training.log_every",
+    "training.save_every_s",
+)
+# Keys that follow from others: the robot, and the numbers of views, states and actions, which older runs have too.
+DERIVED_KEYS = (
+    "robot",
+    "state_dim",
+    "action_dim",
+    "observation.num_views",
+    "encoder.views",
+    "encoder.state_dim",
+    "core.channels",
+    "core.state_token",
+)
+# What a key is in a run that is older than the key.
+LATER_KEYS = {"demos.source": "scripted"}
+
+
+class RunDirectory:
+    """Paths and small files of one run. Reading creates nothing."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def last_state(self) -> Path:
+        return self.checkpoints / "last" / "state.safetensors"
+
+    @property
+    def metrics(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def tensorboard(self) -> Path:
+        return self.path / "tensorboard"
+
+    def rollouts(self, name: str) -> Path:
+        """Where the evaluation `name` keeps its episodes."""
+        return self.path / "rollouts" / name
+
+    def weights_directory(self, step: int) -> Path:
+        return self.checkpoints / f"step-{step}"
+
+    def weight_steps(self) -> list[int]:
+        """Training steps whose weights are kept, ascending."""
+        found = (re.fullmatch(r"step-(\d+)", path.name) for path in self.checkpoints.glob("step-*"))
+        return sorted(int(match.group(1)) for match in found if match)
+
+    def policy_weights(self, step: int | str = LAST) -> Path:
+        """`policy.safetensors` of what `weights_step` takes."""
+        return self.weights_directory(self.weights_step(step)) / "policy.safetensors"
+
+    def weights_step(self, step: int | str = LAST) -> int:
+        """The training step of the kept weights that `checkpoint` names: see `EvaluationOptions.checkpoint`.
+
+        Raises UserError where there are none.
+        """
+        steps = self.weight_steps()
+        if not steps:
+            raise UserError(f"{self.path} has no weights in checkpoints/step-*: wanted a trained run.")
+        if step == LAST:
+            return steps[-1]
+        if "/" in str(step):
+            step = step_of(self.training_steps(), step)
+        if str(step) not in map(str, steps):
+            kept = ", ".join(str(known) for known in steps)
+            raise UserError(
+                f"{self.checkpoints} has no weights of step {step}: kept are {kept}, or take last."
+            )
+        return int(step)
+
+    def config(self) -> dict[str, Any]:
+        """The resolved config of the run. Raises UserError where there is none or the file is broken."""
+        path = self.path / "config.yaml"
+        try:
+            config = read_yaml(path)
+        except FileNotFoundError:
+            raise UserError(f"{self.path} is not a run directory: it has no {path.name}.") from None
+        if not isinstance(config, dict):
+            raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
+        return config
+
+    def refuse_links_outside(self) -> None:
+        """Raises UserError where a link would redirect writes to somewhere else."""
+        home = self.path.resolve()
+        for path in self.path.rglob("*"):
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise UserError(
+                    f"{path} links out of the run directory, to {path.resolve()}: remove that link."
+                )
+
+    def training_steps(self) -> int:
+        """The number of training steps. Raises UserError where the config does not give it."""
+        return training_steps(self.config(), self.path)
+
+    def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
+        """Claims the directory for this config: writes config.yaml, or compares with the existing one.
+
+        `ignored` keys may differ (they say how a run executes). Raises UserError naming other keys that differ.
+        """
+        if not (self.path / "config.yaml").exists():
+            write_text(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False))
+            return
+        differing = differences(self.config(), plain(config), ignored)
+        if differing:
+            raise UserError(
+                f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another "
+                "name=..., or delete that directory if it is not needed."
+            )
+
+    def status(self) -> dict[str, Any]:
+        """The content of status.json, {} before the first one. Raises UserError where it is broken."""
+        path = self.path / "status.json"
+        if not path.exists():
+            return {}
+        return read_json(path, "delete it and run again", mapping=True)
+
+    def write_status(self, state: str, **details: Any) -> None:
+        """state: running, done or failed; `details` (step, error, ...) replace those of before."""
+        write_json(
+            self.path / "status.json",
+            {"state": state, "updated": time.strftime("%Y-%m-%dT%H:%M:%S%z"), **details},
+        )
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Held while a process trains here. Raises UserError where another one does."""
+        path = self.path / ".lock"
+        with clear_write_errors(path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  closed below
+        with file:
+            if not take_lock(file.fileno(), self.path):
+                file.seek(0)
+                owner = file.read().strip() or "unknown"
+                raise UserError(f"{self.path} is in use by process {owner}: wait for it or stop it.")
+            with clear_write_errors(path):
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
+            yield
+
+
+def training_steps(config: Mapping[str, Any], run: Path) -> int:
+    """The number of training steps in a run's config. Raises UserError where it is missing or wrong."""
+    training = config.get("training")
+    steps = training.get("steps") if isinstance(training, Mapping) else None
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+        raise UserError(f"{run}/config.yaml must have training.steps of at least 1, found {steps!r}.")
+    return steps
+
+
+def step_of(steps: int, checkpoint: int | str) -> int:
+    """The step that a checkpoint names in a training of `steps` steps: see `EvaluationOptions.checkpoint`.
+
+    Raises UserError where it names none.
+    """
+    require(CHECKPOINT.holds(checkpoint), "checkpoint", CHECKPOINT.wanted, checkpoint)
+    if checkpoint == LAST:
+        return steps
+    return round(steps * Fraction(checkpoint)) if "/" in str(checkpoint) else int(checkpoint)
+
+
+def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:
+    """16 hex digits that change with any key but the ignored ones."""
+    entries = {key: value for key, value in flatten(plain(config)).items() if not _is_ignored(key, ignored)}
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> list[str]:
+    """One "key was a, is b" per key of nested mappings whose values differ, those apart that follow from others."""
+    before, after = LATER_KEYS | flatten(old), LATER_KEYS | flatten(new)
+    keys = [key for key in {**before, **after} if not _is_ignored(key, ignored)]
+    absent = object()
+    return [
+        f"{key} was {_shown(before, key)}, is {_shown(after, key)}"
+        for key in keys
+        if before.get(key, absent) != after.get(key, absent)
+    ]
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one mapping from dotted keys to leaves; lists are leaves."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def plain(value: Any) -> Any:
+    """The same with dicts and lists only, as YAML gives it back."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _is_ignored(key: str, ignored: tuple[str, ...]) -> bool:
+    return any(key == name or key.startswith(f"{name}.") for name in (*ignored, *DERIVED_KEYS))
+
+
+def _shown(flat: Mapping[str, Any], key: str) -> str:
+    return repr(flat[key]) if key in flat else "absent"

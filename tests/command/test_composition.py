@@ -1,0 +1,45 @@
+import pytest
+
+from imfvla.command.composition import compose
+from imfvla.errors import UserError
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+exp=nope"], r"Unknown exp 'nope': there are .*socket_ph32_exec16, .*transfer_ph32_exec16"),
+        (["+exp=socket_ph32_exec1"], r"did you mean socket_ph32_exec16\?"),
+        (["exp=socket_ph32_exec16"], r"write \+exp=socket_ph32_exec16 instead of exp=socket_ph32_exec16"),
+        (["+epx=socket_ph32_exec16"], r"Unknown key epx: at the top are .*training"),
+        (["task=chess"], r"Unknown task 'chess': there are .*socket, transfer"),
+        (["traning.steps=3"], r"Unknown key traning\.steps \(did you mean training\?\): at the top are"),
+        (
+            ["training.stps=3"],
+            r"Unknown key training\.stps \(did you mean steps\?\): in training are .*steps",
+        ),
+        (["+training.stps=3"], r"Unknown key training\.stps"),
+        (["training.steps.more=3"], r"Unknown key training\.steps\.more"),
+        (["+seed=3"], r"seed exists already: write seed=\.\.\. without a plus sign"),
+        (["training.steps"], r"Cannot read the override 'training\.steps': wanted key=value"),
+        (["observation.views=[front"], r"Cannot read the override"),
+    ],
+)
+def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message):
+    with pytest.raises(UserError, match=message) as caught:
+        compose("train", overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_gives_plain_values():
+    config = compose("train", ["horizon.pred=8", "horizon.exec=4"])
+    assert type(config) is type(config["horizon"]) is dict
+    assert type(config["observation"]["views"]) is list
+    assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4, "ensemble": None}
+
+
+def test_command_line_wins_over_experiment_over_scale():
+    config = compose("train", ["+exp=transfer_ph32_exec16", "scale=paper", "training.batch_size=3"])
+    assert config["name"] == "transfer_ph32_exec16"
+    assert config["task"]["name"] == "transfer"
+    assert config["observation"]["image_size"] == [224, 224]
+    assert config["training"]["batch_size"] == 3
