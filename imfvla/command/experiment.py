@@ -4,7 +4,7 @@ import logging
 import os
 import traceback
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -82,16 +82,15 @@ def _check_environment(config: Mapping[str, Any]) -> None:
     if kind_of(config["task"]) == BIMANUAL:
         select_gl_backend()
         return
-    env = environment_of(config)
-    refuse_other_robot(
-        robot_of(config),
-        env.robot,
-        config["observation"]["views"],
-        of="task.robot",
-        where=f"The environment {env.name}",
-        remedy="Correct task.robot.",
-    )
-    env.close()
+    with closing(environment_of(config)) as env:
+        refuse_other_robot(
+            robot_of(config),
+            env.robot,
+            config["observation"]["views"],
+            of="task.robot",
+            where=f"The environment {env.name}",
+            remedy="Correct task.robot.",
+        )
 
 
 def _check_source(config: Mapping[str, Any]) -> None:
