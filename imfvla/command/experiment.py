@@ -3,7 +3,7 @@
 import logging
 import os
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from typing import Any
 
@@ -38,11 +38,12 @@ INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
 log = logging.getLogger(__name__)
 
 
-def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
+def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequence[str] = ()) -> None:
     """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
 
-    `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
-    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
+    `config` is train.yaml composed under `overrides`, as plain dicts. status.json says running, then done, or failed
+    with the traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be
+    collected.
     """
     options = read_options(config)
     training, optim, evaluation = options.training, options.optim, options.evaluation
@@ -60,7 +61,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         if not is_trained:
             processes.check(training)
         if processes.is_first:
-            _run_stages(config, run, training, optim, evaluation, processes)
+            _run_stages(config, run, overrides, training, optim, evaluation, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, run, training, optim, processes)
 
@@ -109,6 +110,7 @@ def _check_source(config: Mapping[str, Any]) -> None:
 def _run_stages(
     config: Mapping[str, Any],
     run: RunDirectory,
+    overrides: Sequence[str],
     training: TrainingOptions,
     optim: OptimOptions,
     evaluation: EvaluationOptions,
@@ -118,6 +120,7 @@ def _run_stages(
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         _refuse_other_robot(config, run)
+        run.keep_overrides(overrides)
         try:
             is_trained = training.steps in run.weight_steps()
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)

@@ -1,6 +1,6 @@
 """The run directory: the contract between training, evaluation and tables. Needs neither torch nor mujoco.
 
-config.yaml  status.json  train.log  metrics.jsonl  tensorboard/
+config.yaml  overrides.json  status.json  train.log  metrics.jsonl  tensorboard/
 checkpoints/last/state.safetensors            to resume from, bit for bit
 checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
 rollouts/<evaluation>/
@@ -11,7 +11,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +25,8 @@ from imfvla.options import require
 from imfvla.storage.documents import read_json, read_yaml
 from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
 
+OVERRIDES = "overrides.json"
+REMEDY = "delete it; commands are then read from the directory's name"
 RUNNING, DONE, FAILED = "running", "done", "failed"
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
@@ -150,6 +152,22 @@ class RunDirectory:
                 f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another "
                 "name=..., or delete that directory if it is not needed."
             )
+
+    def keep_overrides(self, overrides: Sequence[str]) -> None:
+        """Records the overrides of the command that began the run, unless there are none or some are kept already."""
+        path = self.path / OVERRIDES
+        if overrides and not path.exists():
+            write_json(path, list(overrides))
+
+    def overrides(self) -> list[str] | None:
+        """Those of `keep_overrides`, None without any. Raises UserError where the file is broken."""
+        path = self.path / OVERRIDES
+        if not path.exists():
+            return None
+        found = read_json(path, REMEDY)
+        if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+            raise UserError(f"{path} must hold a list of texts, found {type(found).__name__}; {REMEDY}.")
+        return found
 
     def status(self) -> dict[str, Any]:
         """The content of status.json, {} before the first one. Raises UserError where it is broken."""
