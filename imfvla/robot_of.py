@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
-from imfvla.config.views import ViewOptions
+from imfvla.config.views import ViewOptions, view_options
 from imfvla.environments import BIMANUAL, environment_of, kind_of
-from imfvla.options import build, part_of
+from imfvla.options import part_of
 from imfvla.robot import RobotSpec
 
 KEY = "robot"  # of a run's config, its checkpoints' description and a task's YAML
@@ -35,12 +35,6 @@ def has_environment(config: Mapping[str, Any]) -> bool:
     """Whether policies are rolled out at the end, rather than judged on held-out episodes."""
     task = config.get("task")
     return not isinstance(task, Mapping) or task.get("name") != NO_ENVIRONMENT
-
-
-def view_options(config: Mapping[str, Any]) -> ViewOptions:
-    """What a policy sees. Raises UserError where `observation` is wrong."""
-    seen = {name: part_of(config, f"observation.{name}") for name in ViewOptions.__slots__}
-    return build(ViewOptions, seen, "observation")
 
 
 def _robot(config: Mapping[str, Any], views: ViewOptions) -> RobotSpec:

@@ -14,7 +14,6 @@ from imfvla.config.construction import construct
 from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.nn.residual import AttentionResidual
-from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.reporting.mapping import read_mapping
 from imfvla.robot_of import robot_of
@@ -23,9 +22,9 @@ from imfvla.sources.mcap import McapSource
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.data import make_loader, prepare_windows
+from imfvla.training.experiment import read_experiment
 from imfvla.training.loop import Trainer
 from imfvla.training.optimiser import make_optimiser
-from imfvla.training.options import OptimOptions, TrainingOptions
 
 EXPERIMENTS = sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
 YES = {True: "yes", False: "no"}
@@ -92,18 +91,18 @@ def test_the_reading_of_each_printed_row_is_that_of_its_config(row):
 def test_experiment_trains_resumes_and_is_evaluated(experiment, demonstrations, tmp_path, monkeypatch):
     config = compose("train", [f"+exp={experiment}", *TINY, f"demos.frames_directory={tmp_path}/frames"])
     windows = prepare_windows(config, source_of(config, demonstrations))
-    run = RunDirectory(tmp_path / "run")
+    run, options = RunDirectory(tmp_path / "run"), read_experiment(config)
     run.claim(config)
 
     def trainer() -> Trainer:
         torch.manual_seed(0)
         return Trainer(
             build_policy(config, windows.statistics()),
-            make_loader(config, windows),
+            make_loader(options, windows),
             run,
-            build(TrainingOptions, config["training"], "training"),
-            build(OptimOptions, config["optim"], "optim"),
-            seed=config["seed"],
+            options.training,
+            options.optim,
+            seed=options.seed,
             description={},
         )
 
@@ -143,10 +142,10 @@ def test_experiment_steps_at_the_paper_s_scale(experiment, demonstrations, tmp_p
     small = compose("train", [f"+exp={experiment}", *TINY, f"demos.frames_directory={tmp_path}/frames"])
     tiny = prepare_windows(small, source_of(small, demonstrations))
     config = compose("train", [f"+exp={experiment}", "scale=paper"])
-    build(TrainingOptions, config["training"], "training")
+    options = read_experiment(config)
     policy = build_policy(config, tiny.statistics())
     assert sum(parameter.numel() for parameter in policy.parameters()) > 5e6
-    optimiser = make_optimiser(policy, build(OptimOptions, config["optim"], "optim"))
+    optimiser = make_optimiser(policy, options.optim)
     batch = tiny.batch(np.arange(1), np.random.default_rng(0))
     height, width = config["observation"]["image_size"]
     images = torch.randint(256, (*batch.obs.images.shape[:-2], height, width), dtype=torch.uint8)
@@ -167,7 +166,7 @@ def test_exec_beyond_pred_is_refused():
 def test_batches_depend_on_seed_and_number_alone(demonstrations):
     config = compose("train", TINY)
     windows = prepare_windows(config, McapSource.of(demonstrations))
-    one, other = make_loader(config, windows), make_loader(config, windows)
+    one, other = (make_loader(read_experiment(config), windows) for _ in range(2))
     next(one)
     other.load_state_dict(one.state_dict())
     first, second = next(one), next(other)

@@ -40,7 +40,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from imfvla.command.composition import compose
-from imfvla.command.rehearsal import read_options, rehearse
+from imfvla.command.rehearsal import checked_options, rehearse
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
@@ -198,7 +198,7 @@ def mutate_one_value(data: bytes, rng: random.Random) -> bytes:
 def check_options(path: Path) -> None:
     """What `imfvla.train` checks before its first stage, in a config that is whole JSON."""
     config = json.loads(path.read_bytes())
-    rehearse(config, read_options(config).evaluation.nfe)
+    rehearse(config, checked_options(config).evaluation.nfe)
 
 
 def mutate_yaml(data: bytes, rng: random.Random) -> bytes:

@@ -103,6 +103,7 @@ def start(episodes: int, folder: Path, began: float) -> dict[str, Any]:
     config, source, parts = prepare(episodes, folder)
     from imfvla.policy import build_policy
     from imfvla.training.data import make_loader, prepare_windows
+    from imfvla.training.experiment import read_experiment
 
     with timed(parts, "windows"):
         windows = prepare_windows(config, source)
@@ -110,7 +111,7 @@ def start(episodes: int, folder: Path, began: float) -> dict[str, Any]:
         statistics = windows.statistics()
     with timed(parts, "policy"):
         policy = build_policy(config, statistics)
-    with make_loader(config, windows) as batches:
+    with make_loader(read_experiment(config), windows) as batches:
         with timed(parts, "first batch"):
             next(batches)
         whole = time.time() - began

@@ -23,13 +23,12 @@ import numpy as np
 import psutil
 
 from imfvla.command.composition import compose
-from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.sources.mcap import McapSource
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
+from imfvla.training.experiment import read_experiment
 from imfvla.training.loop import Trainer
-from imfvla.training.options import OptimOptions, TrainingOptions
 
 Watch = Callable[[], None]
 ALLOWED_GROWTH = 0.05
@@ -78,14 +77,15 @@ def training(count: int, watch: Watch) -> None:
         "training.log_every=10",
     ]
     config = compose("train", [*sizes, *pace])
+    options = read_experiment(config)
     with tempfile.TemporaryDirectory(prefix="imfvla-memory-") as folder:
         windows = prepare_windows(config, McapSource.of(write_demonstrations(Path(folder) / "demos")))
         Trainer(
             build_policy(config, windows.statistics()),
-            Watched(make_loader(config, windows), watch),
+            Watched(make_loader(options, windows), watch),
             RunDirectory(Path(folder) / "run"),
-            build(TrainingOptions, config["training"], "training"),
-            build(OptimOptions, config["optim"], "optim"),
+            options.training,
+            options.optim,
             seed=0,
             description={},
         ).train()

@@ -30,14 +30,13 @@ from torch import Tensor
 
 from imfvla.command.composition import compose
 from imfvla.data.statistics import Statistics
-from imfvla.options import build
 from imfvla.policy import build_policy
 from imfvla.robot_of import robot_of
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import save_state
+from imfvla.training.experiment import read_experiment
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
-from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import joined_processes
 from imfvla.training.sharding import SHARDINGS
 from imfvla.types import MAX_WORDS, Batch, Observation
@@ -92,7 +91,7 @@ class Noise:
 def measure(overrides: list[str], run: str) -> None:
     """One process of a training: writes what it measured beside `run`."""
     config = compose("train", overrides)
-    batches = Noise(config)
+    batches, options = Noise(config), read_experiment(config)
     with joined_processes("cpu") as processes:
         before = psutil.Process().memory_info().rss
         torch.manual_seed(0)
@@ -100,8 +99,8 @@ def measure(overrides: list[str], run: str) -> None:
             build_policy(config, batches.statistics()),
             batches,
             RunDirectory(run),
-            build(TrainingOptions, config["training"], "training"),
-            build(OptimOptions, config["optim"], "optim"),
+            options.training,
+            options.optim,
             seed=0,
             description={},
             processes=processes,

@@ -4,6 +4,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,12 @@ import torch
 from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
-from imfvla.options import build
 from imfvla.policy import Policy
 from imfvla.sources.base import EpisodeSource
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows
+from imfvla.training.experiment import read_experiment
 from imfvla.training.loop import Trainer
-from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.precision import autocast
 from imfvla.types import Batch
 
@@ -34,14 +34,20 @@ def measure_training(
     without the Jacobian-vector product, that product, backward, and clipping with optimiser and average
     of the weights.
     """
-    options = build(TrainingOptions, {**config["training"], "steps": steps, "checkpoints": 1}, "training")
-    optim = build(OptimOptions, config["optim"], "optim")
+    read = read_experiment(config)
+    options = replace(read.training, steps=steps, checkpoints=1)
     windows = prepare_windows(config, demonstrations)
     trainer = Trainer(
-        policy, make_loader(config, windows), RunDirectory(scratch), options, optim, seed=0, description={}
+        policy,
+        make_loader(read, windows),
+        RunDirectory(scratch),
+        options,
+        read.optim,
+        seed=0,
+        description={},
     )
     num_threads, precision = torch.get_num_threads(), trainer.precision
-    batches = make_loader(config, windows)
+    batches = make_loader(read, windows)
     try:
         batch = next(batches).to(trainer.device)
         flops = training_flops(policy, batch, precision)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.command.rehearsal import read_options, rehearse
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.command.rehearsal import checked_options, rehearse
+from imfvla.config.views import view_options
 from imfvla.data.held_out import held_out
 from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.errors import UserError
@@ -29,8 +29,8 @@ from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
+from imfvla.training.experiment import ExperimentOptions
 from imfvla.training.loop import Trainer
-from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.parallel import Alone, joined_processes
 
 STAGES = TRAIN, EVALUATE = "train", "evaluate"
@@ -45,11 +45,10 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     with the traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be
     collected.
     """
-    options = read_options(config)
-    training, optim, evaluation = options.training, options.optim, options.evaluation
-    is_trained = training.steps in run.weight_steps()
+    options = checked_options(config)
+    is_trained = options.training.steps in run.weight_steps()
     config = with_robot(config)
-    policy = rehearse(config, evaluation.nfe, evaluation.noise_scale)
+    policy = rehearse(config, options.evaluation.nfe, options.evaluation.noise_scale)
     if not is_trained:
         _check_source(config)
         if not run.last_state.exists():
@@ -57,13 +56,13 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     run.refuse_links_outside()
     if has_environment(config) and run.status().get("state") != DONE:
         _check_environment(config)  # else training would end before an evaluation that fails
-    with joined_processes(training.device) as processes:
+    with joined_processes(options.training.device) as processes:
         if not is_trained:
-            processes.check(training)
+            processes.check(options.training)
         if processes.is_first:
-            _run_stages(config, run, overrides, training, optim, evaluation, processes)
+            _run_stages(config, options, run, overrides, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
-            _train(config, run, training, optim, processes)
+            _train(config, options, run, processes)
 
 
 def _refuse_other_robot(config: Mapping[str, Any], run: RunDirectory) -> None:
@@ -71,7 +70,7 @@ def _refuse_other_robot(config: Mapping[str, Any], run: RunDirectory) -> None:
     refuse_other_robot(
         robot_of(run.config()),
         robot_of(config),
-        config["observation"]["views"],
+        view_options(config).views,
         of=f"the run in {run.path}",
         where="The task or its data",
         remedy="Choose another name=... for it.",
@@ -87,7 +86,7 @@ def _check_environment(config: Mapping[str, Any]) -> None:
         refuse_other_robot(
             robot_of(config),
             env.robot,
-            config["observation"]["views"],
+            view_options(config).views,
             of="task.robot",
             where=f"The environment {env.name}",
             remedy="Correct task.robot.",
@@ -109,11 +108,9 @@ def _check_source(config: Mapping[str, Any]) -> None:
 
 def _run_stages(
     config: Mapping[str, Any],
+    options: ExperimentOptions,
     run: RunDirectory,
     overrides: Sequence[str],
-    training: TrainingOptions,
-    optim: OptimOptions,
-    evaluation: EvaluationOptions,
     processes: Alone,
 ) -> None:
     """All stages, except the other processes' shares of training."""
@@ -122,17 +119,17 @@ def _run_stages(
         _refuse_other_robot(config, run)
         run.keep_overrides(overrides)
         try:
-            is_trained = training.steps in run.weight_steps()
+            is_trained = options.training.steps in run.weight_steps()
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)
             if is_trained:
-                log.info(f"{run.path} is trained already: all {training.steps} steps are done.")
+                log.info(f"{run.path} is trained already: all {options.training.steps} steps are done.")
             else:
-                _train(config, run, training, optim, processes)
+                _train(config, options, run, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
             if has_environment(config):
-                evaluate(run, evaluation)  # of a finished evaluation it only reads the summary
+                evaluate(run, options.evaluation)  # of a finished evaluation it only reads the summary
             else:
-                evaluate_offline(run, config, evaluation)
+                evaluate_offline(run, config, options.evaluation)
             if run.status().get("state") != DONE:
                 run.write_status(DONE)
         except KeyboardInterrupt:
@@ -149,11 +146,7 @@ def _run_stages(
 
 
 def _train(
-    config: Mapping[str, Any],
-    run: RunDirectory,
-    training: TrainingOptions,
-    optim: OptimOptions,
-    processes: Alone,
+    config: Mapping[str, Any], options: ExperimentOptions, run: RunDirectory, processes: Alone
 ) -> None:
     if processes.is_first:
         run.write_status(RUNNING, phase="demonstrations", pid=os.getpid())
@@ -163,8 +156,7 @@ def _train(
     else:
         processes.wait()  # for demonstrations and frame store, which exist by then
         windows = prepare_windows(config, open_source(config))
-    seed = config["seed"]
-    initial = np.random.SeedSequence([seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
+    initial = np.random.SeedSequence([options.seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
     policy = build_policy(config, windows.statistics())
     if not run.last_state.exists():  # a state has the weights, and their file may be gone
@@ -173,14 +165,14 @@ def _train(
     log.info(f"{len(windows)} training items, {num_parameters / 1e6:.2f} M parameters")
     trainer = Trainer(
         policy,
-        make_loader(config, windows),
+        make_loader(options, windows),
         run,
-        training,
-        optim,
-        seed=seed,
+        options.training,
+        options.optim,
+        seed=options.seed,
         description={
-            "name": config["name"],
-            "seed": seed,
+            "name": options.name,
+            "seed": options.seed,
             "num_parameters": num_parameters,
             "robot": robot_of(config).to_json(),
             "config_digest": config_digest(config, EXECUTION_KEYS),

@@ -1,58 +1,31 @@
 """Finds before the first stage what would fail later: options out of range, a policy that cannot learn."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 
 from imfvla.config.construction import reason_of
-from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import MAX_SEED, USUAL_NOISE, EvaluationOptions
-from imfvla.data import Augmentation
+from imfvla.config.protocol import USUAL_NOISE
 from imfvla.errors import UserError
-from imfvla.options import build, one_of, part_of, require, within
+from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
-from imfvla.policy.chunks import FRAMES
-from imfvla.robot_of import has_environment, view_options
+from imfvla.robot_of import has_environment
 from imfvla.rollouts.evaluation import require_device
 from imfvla.storage.run_directory import step_of
+from imfvla.training.experiment import ExperimentOptions, read_experiment
 from imfvla.training.loop import choose_device
-from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.types import MAX_WORDS, Batch, Observation
 
 
-@dataclass(frozen=True, slots=True)
-class Scalars:
-    """The keys of train.yaml outside of groups."""
-
-    name: str
-    seed: Annotated[int, within(0, MAX_SEED)]
-    action_frame: Annotated[str, one_of(*FRAMES)]
-
-
-@dataclass(frozen=True, slots=True)
-class ExperimentOptions:
-    """The checked groups of train.yaml that training and evaluation read."""
-
-    training: TrainingOptions
-    optim: OptimOptions
-    evaluation: EvaluationOptions
-
-
-def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
-    """The options of all stages except those of policy and demonstrations. Raises UserError on the first wrong one."""
-    build(Scalars, {name: part_of(config, name) for name in Scalars.__slots__}, "")
-    build(Horizon, part_of(config, "horizon"), "horizon")
-    build(Augmentation, part_of(config, "augmentation"), "augmentation")
-    view_options(config)
+def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
+    """The options of an experiment that can run here. Raises UserError on the first that is wrong."""
+    options = read_experiment(config)
+    training, evaluation = options.training, options.evaluation
     if not has_environment(config):
         part_of(config, "task.held_out")
     paraphrases = part_of(config, "task.paraphrases")
     require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
-    training = build(TrainingOptions, part_of(config, "training"), "training")
-    optim = build(OptimOptions, part_of(config, "optim"), "optim")
-    evaluation = build(EvaluationOptions, part_of(config, "evaluation"), "evaluation")
     choose_device(training.device)
     require_device(evaluation.device, "evaluation.device")
     kept = training.checkpoint_steps()
@@ -63,7 +36,7 @@ def read_options(config: Mapping[str, Any]) -> ExperimentOptions:
         f"{', '.join(map(str, sorted(kept)))}",
         evaluation.checkpoint,
     )
-    return ExperimentOptions(training, optim, evaluation)
+    return options
 
 
 def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:

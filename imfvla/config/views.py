@@ -1,9 +1,10 @@
 """What an observation shows: which cameras, and how large their pictures may be."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from imfvla.options import require
+from imfvla.options import build, part_of, require
 
 SIZE = "observation.image_size"
 SMALLEST = 8  # pixels of a side
@@ -31,3 +32,9 @@ def require_drawable(size: Sequence[int], largest: tuple[int, int]) -> None:
     """Raises UserError where pictures (H, W) [px] are larger than the buffer that they would be drawn into."""
     fits = size[0] <= largest[0] and size[1] <= largest[1]
     require(fits, SIZE, f"at most {list(largest)}, the buffer that pictures are drawn into", list(size))
+
+
+def view_options(config: Mapping[str, Any]) -> ViewOptions:
+    """What a policy sees, of a composed config or a run's. Raises UserError where `observation` is wrong."""
+    seen = {name: part_of(config, f"observation.{name}") for name in ViewOptions.__slots__}
+    return build(ViewOptions, seen, "observation")

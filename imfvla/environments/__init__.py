@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from imfvla.config.construction import construct
-from imfvla.config.views import ViewOptions
+from imfvla.config.views import view_options
 from imfvla.environment import Environment
 from imfvla.errors import UserError
-from imfvla.options import build, part_of
+from imfvla.options import part_of
 
 KIND = "task.kind"
 BIMANUAL, GYMNASIUM = "bimanual", "gymnasium"
@@ -26,7 +26,7 @@ def environment_of(config: Mapping[str, Any]) -> Environment:
     """
     task = part_of(config, "task")
     if kind_of(task) == COMPONENT:
-        shown = _shown(config)
+        shown = view_options(config)
         return construct(
             {key: value for key, value in task.items() if key not in SHARED},
             "task",
@@ -41,7 +41,7 @@ def environment_of(config: Mapping[str, Any]) -> Environment:
         return load(task, part_of(config, "observation"))
     from imfvla import tasks  # here, since few configs are of these tasks' robot
 
-    shown = _shown(config)
+    shown = view_options(config)
     return tasks.load(
         part_of(config, "task.name"),
         variant=part_of(config, "task.variant"),
@@ -58,8 +58,3 @@ def kind_of(task: Mapping[str, Any]) -> str:
     if kind not in KINDS:
         raise UserError(f"{KIND} must be one of {', '.join(KINDS)}, found {kind!r}: choose another task=...")
     return kind
-
-
-def _shown(config: Mapping[str, Any]) -> ViewOptions:
-    seen = {key: part_of(config, f"observation.{key}") for key in ViewOptions.__slots__}
-    return build(ViewOptions, seen, "observation")

@@ -34,6 +34,7 @@ class Generator(Protocol):
         ...
 
 
+LAST_STEP = within(0.01, 0.99)  # a time between noise and data
 TimeSampler = Callable[[int, torch.Generator], Tensor]  # how many, from which stream -> (n,) in [0, 1]
 
 
@@ -77,6 +78,17 @@ class HighNoiseTimes:
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
         return 1 - self.span * torch.rand(count, generator=rng) ** self.power
+
+
+def step_times(nfe: int, last_step: float | None = None) -> Tensor:
+    """Times (nfe + 1,) from noise, 1, to data, 0: equal steps; with `last_step` the last of several starts there.
+
+    A last step from low noise gives a sharp sample: its network sees a chunk that is nearly decided, and gives the one
+    nearest to it. One from t = 1/2 gives a mean over what is still open there (arXiv 2512.01809 refines from 0.1).
+    """
+    if last_step is None:
+        return torch.linspace(1, 0, nfe + 1)
+    return torch.cat((torch.linspace(1, last_step, nfe), torch.zeros(1)))
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:

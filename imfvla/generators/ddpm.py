@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.generators.base import masked_error, refuse_nfe
+from imfvla.generators.base import LAST_STEP, masked_error, refuse_nfe, step_times
 from imfvla.options import above
 
 MAX_BETA = 0.999
@@ -33,9 +33,11 @@ def squared_cosine(num_levels: int) -> Tensor:
     return (1 - (1 - kept[1:] / kept[:-1]).clamp(max=MAX_BETA)).cumprod(0)
 
 
-def trailing_levels(num_levels: int, nfe: int) -> list[int]:
-    """`nfe` noise levels, noisiest first, evenly spaced from K - 1 down (arXiv 2305.08891)."""
-    return [round(num_levels * (nfe - i) / nfe) - 1 for i in range(nfe)]
+def trailing_levels(num_levels: int, nfe: int, last_step: float | None = None) -> list[int]:
+    """`nfe` noise levels, noisiest first, evenly spaced from K - 1 down (arXiv 2305.08891), or as `step_times` says."""
+    if last_step is None:
+        return [round(num_levels * (nfe - i) / nfe) - 1 for i in range(nfe)]
+    return [max(round(num_levels * t) - 1, 0) for t in step_times(nfe, last_step).tolist()[:-1]]
 
 
 def ancestral_noise(noise: Tensor, count: int) -> Tensor:
@@ -60,6 +62,7 @@ class DenoisingDiffusion:
     clip_sample: whether the clean action that each step estimates is clamped to [-clip, clip].
     draws: noise draws per observation; the observation is encoded once for all of them.
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
+    last_step: of DDIM, the share of the levels below which the last of several steps is taken, see `step_times`.
     """
 
     core_interface = "flow"
@@ -72,6 +75,7 @@ class DenoisingDiffusion:
         clip_sample: bool,
         draws: int,
         clip: Annotated[float, above(0)],
+        last_step: Annotated[float, LAST_STEP] | None = None,
     ) -> None:
         if prediction not in ("epsilon", "sample", "v"):
             raise UserError(f"generator.prediction must be epsilon, sample or v, found {prediction!r}.")
@@ -81,7 +85,7 @@ class DenoisingDiffusion:
             raise UserError(f"generator.draws must be at least 1, found {draws}.")
         self.prediction = prediction
         self.clip_sample, self.clip = clip_sample, clip
-        self.draws = draws
+        self.draws, self.last_step = draws, last_step
         self.num_levels = self.ancestral_nfe = num_levels  # where each step draws noise of its own
         self.kept = squared_cosine(num_levels).tolist()
 
@@ -127,7 +131,7 @@ class DenoisingDiffusion:
 
     def ddim(self, core: nn.Module, context: Any, z: Tensor, nfe: int) -> Tensor:
         """z_j = sqrt(abar_j) x + sqrt(1 - abar_j) e over trailing levels; the last estimate of x is the sample."""
-        levels = trailing_levels(self.num_levels, nfe)
+        levels = trailing_levels(self.num_levels, nfe, self.last_step)
         for k, following in pairwise(levels):
             x, noise = self.estimate(core, z, k, context)
             z = self.kept[following] ** 0.5 * x + (1 - self.kept[following]) ** 0.5 * noise

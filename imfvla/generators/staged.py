@@ -12,13 +12,14 @@ blocks and read the same context.
 Shapes: B batch, N draws per observation, H steps, A action.
 """
 
+from itertools import pairwise
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.generators.base import masked_error
+from imfvla.generators.base import masked_error, step_times
 from imfvla.generators.velocity import AverageVelocity, interpolate
 from imfvla.options import SHARE_BELOW_1, at_least, one_of
 
@@ -27,7 +28,7 @@ class StagedMeanFlow(AverageVelocity):
     """Learns and samples an average velocity.
 
     average_from: share of the training after which the average velocity is learned, in [0, 1).
-    path_steps: Euler steps along the flow from which an average velocity is taken.
+    path_steps: Euler steps along the flow from which an average velocity is taken, those that `sample` takes with v.
     boundary_share: of the intervals, the share that is (0, 1). At 1, one step is taken with u and more with v.
     velocity_head: true, as the average velocity has action blocks of its own; the core takes this key from here.
     The rest as in `AverageVelocity`; all draws of the second stage are intervals.
@@ -71,33 +72,21 @@ class StagedMeanFlow(AverageVelocity):
             )
 
     def _first_step(self, steps: int) -> int:
-        return round(self.average_from * steps)
+        return min(round(self.average_from * steps), steps - 1)  # the last one at least is of it
 
     def path_velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
         """Mean of v along the flow from z at t to r, without gradient: (B, H, A)."""
-        total = torch.zeros_like(z)
-        length = ((t - r) / self.path_steps)[:, None, None]
+        mean, length = torch.zeros_like(z), (t - r)[:, None, None]
         with torch.no_grad():
-            for k in range(self.path_steps):
-                v = self.instant_velocity(core, z, t + (r - t) * (k / self.path_steps), context)
-                total, z = total + v, z - length * v
-        return total / self.path_steps
+            for begin, end in pairwise(step_times(self.path_steps, self.last_step).tolist()):
+                v = (begin - end) * self.instant_velocity(core, z, r + (t - r) * begin, context)
+                mean, z = mean + v, z - length * v
+        return mean
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
-        """A chunk (B, H, A) in `nfe` equal steps: the first along u(z, 0, 1), so straight towards where the flow ends,
-        the others along v. Weights that have no u yet take all of them along v; where u has learned parts of the
-        interval too (`boundary_share` below 1), u takes all.
-        """
-        instant = self.instant_core(core)
-        if self.learns_average is False:
-            return super().sample(instant, context, noise, nfe)
-        if self.boundary_share < 1:
-            return super().sample(core, context, noise, nfe)
-        self.check_nfe(nfe)
-        start, end = torch.ones(len(noise)).to(noise), torch.zeros(len(noise)).to(noise)
-        z = noise - self.velocity(core, noise, end, start, context) / nfe
-        rest = torch.linspace(1, 0, nfe + 1)[1:]
-        return self.follow(instant, context, z, rest).clamp(-self.clip, self.clip)
+        """A chunk (B, H, A): one step of u; more of them too, or of v where u has learned the whole interval alone."""
+        takes_average = nfe == 1 or self.boundary_share < 1
+        return super().sample(core if takes_average else self.instant_core(core), context, noise, nfe)
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator

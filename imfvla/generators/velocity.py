@@ -11,11 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.generators.base import TimeSampler, refuse_nfe
+from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
-
-Core = Callable[[Tensor, Tensor, Tensor, Any], Tensor]  # (z, t, r, context) -> (B, H, A)
 
 MIN_TIME = 0.02  # of training in the data form u = (z - D) / t, whose error grows without bound towards t = 0
 
@@ -34,6 +32,7 @@ class LinearPath:
     adaptive_power, adaptive_offset: see `adapt`.
     draws: noise draws per observation; the observation is encoded once for all of them.
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
+    last_step: the time from which the last of several steps is taken, see `step_times`.
     """
 
     core_interface = "flow"
@@ -48,6 +47,7 @@ class LinearPath:
         adaptive_offset: Annotated[float, above(0)],
         draws: int,
         clip: Annotated[float, above(0)],
+        last_step: Annotated[float, LAST_STEP] | None = None,
     ) -> None:
         if parametrisation not in ("data", "velocity"):
             raise UserError(f"generator.parametrisation must be data or velocity, found {parametrisation!r}.")
@@ -59,8 +59,9 @@ class LinearPath:
         self.adaptive_power, self.adaptive_offset = adaptive_power, adaptive_offset
         self.draws = draws
         self.clip = clip
+        self.last_step = last_step
 
-    def velocity(self, core: Core, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
+    def velocity(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any) -> Tensor:
         """u(z, r, t): z (B, H, A), r and t > 0 (B,) -> (B, H, A)."""
         output = core(z, t, r, context)
         if self.parametrisation == "velocity":
@@ -100,16 +101,13 @@ class LinearPath:
             raise refuse_nfe("at least 1", nfe)
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
-        """A chunk (B, H, A) in `nfe` equal steps from t = 1 to 0."""
+        """z_r = z_t - (t - r) u(z_t, r, t) over `nfe` intervals from t = 1 to 0."""
         self.check_nfe(nfe)
-        return self.follow(core, context, noise, torch.linspace(1, 0, nfe + 1)).clamp(-self.clip, self.clip)
-
-    def follow(self, core: Core, context: Any, z: Tensor, times: Tensor) -> Tensor:
-        """z_r = z_t - (t - r) u(z_t, r, t) from each of `times` (K,) to the next: z (B, H, A) at the last of them."""
-        for t, r in pairwise(times.to(z)):
+        z = noise
+        for t, r in pairwise(step_times(nfe, self.last_step).to(noise)):
             ts, rs = t.expand(len(z)), r.expand(len(z))
             z = z - (t - r) * self.velocity(core, z, rs, ts, context)
-        return z
+        return z.clamp(-self.clip, self.clip)
 
 
 class AverageVelocity(LinearPath):
@@ -141,7 +139,7 @@ class AverageVelocity(LinearPath):
         """v(z, t), of blocks of its own where the core has them, else u(z, t, t): z (B, H, A), t (B,) -> (B, H, A)."""
         return self.velocity(self.instant_core(core), z, t, t, context)
 
-    def instant_core(self, core: nn.Module) -> Core:
+    def instant_core(self, core: nn.Module) -> Callable[[Tensor, Tensor, Tensor, Any], Tensor]:
         """What answers (z, t, r, context) as the blocks of v do, whatever r."""
         if self.core_interface == "flow":
             return lambda z, t, r, context: core(z, t, t, context)

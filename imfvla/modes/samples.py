@@ -8,6 +8,7 @@ import torch
 
 from imfvla.modes.observations import Observations
 from imfvla.policy import Policy
+from imfvla.policy.noise import chunk_noise
 from imfvla.types import Observation
 
 ROWS = 256  # chunks that are computed together
@@ -29,16 +30,9 @@ def draw_samples(policy: Policy, observations: Observations, nfe: int, num: int)
             torch.from_numpy(np.stack(values[rows])).to(device)
             for values in (observations.images, observations.state, observations.instruction)
         )
-        noise = np.stack(
-            [
-                np.random.default_rng(np.random.SeedSequence([k, *place])).standard_normal(
-                    policy.noise_shape, dtype=np.float32
-                )
-                for place in observations.places[rows]
-                for k in range(num)
-            ]
-        )
+        places = [(k, *place) for place in observations.places[rows] for k in range(num)]
+        noise = chunk_noise(policy.noise_shape, places)
         seen = Observation(images.permute(0, 1, 2, 5, 3, 4), state, instruction)
-        chunk = policy.predict(seen, torch.from_numpy(noise).to(device), nfe)
+        chunk = policy.predict(seen, noise.to(device), nfe)
         chunks.append(chunk.float().cpu().numpy().reshape(-1, num, *policy.noise_shape))
     return np.concatenate(chunks)

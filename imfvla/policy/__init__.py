@@ -12,12 +12,13 @@ from torch import Tensor, nn
 from imfvla.config.construction import construct, reason_of
 from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
 from imfvla.policy.chunks import ChunkFrame
 from imfvla.robot import RobotSpec
-from imfvla.robot_of import robot_of, view_options
+from imfvla.robot_of import robot_of
 from imfvla.types import Batch, Observation
 
 

@@ -29,7 +29,7 @@ class WrongSetting(UserError):
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Probed:
     """What `gl_probe` found: `problem` is None where the backend draws."""
 
     devices: int = 0
@@ -100,7 +100,7 @@ def _first_that_draws(candidates: tuple[str, ...]) -> str:
     raise UserError(f"{found} ({'; '.join(problems)}); {remedy}.")
 
 
-def _egl() -> Answer:
+def _egl() -> Probed:
     """The answer of EGL on the device that MUJOCO_EGL_DEVICE_ID names, if any."""
     device = os.environ.get(DEVICE_KEY)
     if device is not None and not device.strip():
@@ -122,7 +122,7 @@ def _egl() -> Answer:
     return answer
 
 
-def _probe(backend: str) -> Answer:
+def _probe(backend: str) -> Probed:
     """Asks `gl_probe` in a process of its own; one that hangs or dies has a backend that does not draw."""
     program = Path(__file__).with_name("gl_probe.py")
     try:
@@ -130,7 +130,7 @@ def _probe(backend: str) -> Answer:
             [sys.executable, "-I", str(program), backend], capture_output=True, timeout=PROBE_TIMEOUT_S
         )
     except subprocess.TimeoutExpired:
-        return Answer(problem=f"no answer within {PROBE_TIMEOUT_S:g} s")
+        return Probed(problem=f"no answer within {PROBE_TIMEOUT_S:g} s")
     if child.returncode != 0:
-        return Answer(problem=f"its driver died with exit code {child.returncode}")
-    return Answer(**json.loads(child.stdout.splitlines()[-1]))
+        return Probed(problem=f"its driver died with exit code {child.returncode}")
+    return Probed(**json.loads(child.stdout.splitlines()[-1]))

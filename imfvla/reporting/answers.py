@@ -10,7 +10,8 @@ from typing import Any
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import REMEDY, read_episodes
 from imfvla.reporting.mapping import Mapping, TableRow, Wanted
-from imfvla.reporting.metrics import Row, summarise
+from imfvla.reporting.metrics import summarise
+from imfvla.reporting.rows import Row
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
 from imfvla.storage.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
 from imfvla.storage.run_names import run_name

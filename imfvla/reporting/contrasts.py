@@ -10,9 +10,9 @@ from scipy import stats
 from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
 from imfvla.reporting.estimates import log_pooled_mean, share_difference
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.metrics import TIMING
 from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.power import detectable_difference, detectable_share_difference
+from imfvla.reporting.rows import TIMING
 from imfvla.reporting.significance import mcnemar, sign_flip, signed_rank
 
 # experiments/protocol.md says which of them is used where

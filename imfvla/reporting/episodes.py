@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.reporting.metrics import TIMING, Row
+from imfvla.reporting.rows import TIMING, Row
 from imfvla.storage.documents import parse_json, read_lines
 
 REMEDY = "restore the file or evaluate again with overwrite=true"

@@ -10,7 +10,6 @@ from scipy import stats
 
 from imfvla.reporting.bootstrap import TAILS, Statistic, bootstrap
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.metrics import wilson_interval
 
 
 def mean(values: np.ndarray) -> Measured:
@@ -107,3 +106,16 @@ def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:
 def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:
     """The statistic of `pooled_mean`."""
     return np.log(totals.sum(axis=axis)) - np.log(counts.sum(axis=axis))
+
+
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's score interval of a share (default 95%), within [0, 1] (E. B. Wilson, JASA 22, 1927)."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"Wanted 0 <= successes <= trials and trials >= 1, found {successes} of {trials}.")
+    share = successes / trials
+    centre = share + z**2 / (2 * trials)
+    spread = z * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
+    scale = 1 + z**2 / trials
+    low = 0.0 if successes == 0 else (centre - spread) / scale
+    high = 1.0 if successes == trials else (centre + spread) / scale
+    return low, high

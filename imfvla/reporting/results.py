@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-import numpy as np
-
-from imfvla.reporting import estimates
 from imfvla.reporting.answers import Answer, Evaluated
+from imfvla.reporting.estimates import wilson_interval
 from imfvla.reporting.mapping import TableRow
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.metrics import TIMING, Row, summarise, wilson_interval
+from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
+from imfvla.reporting.rows import Row
 
 
 class Result:
@@ -78,19 +77,11 @@ class Result:
 
     @cached_property
     def metrics(self) -> dict[str, Measured]:
-        """By name: those of `metrics.summarise`, `iqm_return` and shares, with intervals where there are any."""
+        """By name: every one of `METRICS`."""
         if self.is_missing:
-            names = (*SUMMARISED, *ESTIMATED, "inference_fps")
-            return dict.fromkeys(names, Measured(None))
-        summary = summarise(self.episodes)
-        metrics = {name: Measured(summary[name]) for name in SUMMARISED}
-        for name, (estimate, *columns) in ESTIMATED.items():
-            by_seed = (np.stack([column(found.episodes) for found in self.evaluated]) for column in columns)
-            metrics[name] = estimate(*by_seed)
-        latency = metrics["inference_ms_mean"]
-        rates = (None if ms is None else 1000 / ms for ms in (latency.value, latency.high, latency.low))
-        metrics["inference_fps"] = Measured(*rates)
-        return metrics
+            return {metric.name: Measured(None) for metric in METRICS}
+        by_seed = [found.episodes for found in self.evaluated]
+        return {metric.name: metric.measured(by_seed) for metric in METRICS}
 
     @cached_property
     def paper_success_share(self) -> Measured:
@@ -99,42 +90,3 @@ class Result:
             return Measured(None)
         count, number = self.paper.success, self.paper.episodes
         return Measured(count / number, *wilson_interval(count, number))
-
-
-def returns(episodes: Sequence[Row]) -> np.ndarray:
-    return np.array([row["total_reward"] for row in episodes], float)
-
-
-def highest_rewards(episodes: Sequence[Row]) -> np.ndarray:
-    return np.array([row["max_reward"] for row in episodes], float)
-
-
-def inference_times(episodes: Sequence[Row]) -> np.ndarray:
-    """Sum of the times of an episode's chunks [ms]."""
-    return np.array([sum(row[TIMING]["inference_ms"]) for row in episodes], float)
-
-
-def num_inferences(episodes: Sequence[Row]) -> np.ndarray:
-    return np.array([len(row[TIMING]["inference_ms"]) for row in episodes], int)
-
-
-def successes(episodes: Sequence[Row]) -> np.ndarray:
-    return np.array([row["success"] for row in episodes], bool)
-
-
-def rewarded(episodes: Sequence[Row]) -> np.ndarray:
-    return returns(episodes) > 0
-
-
-SUMMARISED = (
-    "max_return", "nonzero_episodes", "success_episodes", "control_fps", "inference_ms_median", "inference_ms_p95",
-)  # fmt: skip
-ESTIMATED = {
-    "avg_return": (estimates.mean, returns),
-    "median_return": (estimates.median, returns),
-    "iqm_return": (estimates.interquartile_mean, returns),
-    "mean_max_reward": (estimates.mean, highest_rewards),
-    "inference_ms_mean": (estimates.pooled_mean, inference_times, num_inferences),
-    "nonzero_share": (estimates.share, rewarded),
-    "success_share": (estimates.share, successes),
-}

@@ -1,22 +1,23 @@
 """The row of a run beside the paper's printed one: for the terminal, `table_row.md` and `table_row.json`."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
 
-from imfvla.reporting.metrics import wilson_interval
+from imfvla.reporting.cells import SHOWN, TITLES, alone, printed
+from imfvla.reporting.estimates import wilson_interval
+from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
-from imfvla.reporting.runs import METRICS, Evaluation, evaluations, rows
-from imfvla.reporting.table import NOTHING, Table, number
+from imfvla.reporting.runs import Evaluation, evaluations, rows
+from imfvla.reporting.table import Table
 from imfvla.storage.files import write_json, write_text
 from imfvla.storage.run_directory import LAST, RunDirectory
 
-COLUMNS = (
-    "nfe", "source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "95% interval",
-    "Latency ms", "p95 ms", "Inf. FPS", "Control FPS",
-)  # fmt: skip
+BEHIND = [metric.name for metric in SHOWN].index("success_episodes") + 1  # where its interval has a column
+IN_JSON = ("episodes", *(metric.name for metric in METRICS), "success_interval", "failures")
+COLUMNS = ("nfe", "source", *TITLES[:BEHIND], "95% interval", *TITLES[BEHIND:])
 
 
 def print_row(run: RunDirectory, console: Console | None = None, *, only: Collection[str] = ()) -> None:
@@ -40,7 +41,7 @@ def table_of(found: Sequence[Evaluation]) -> Table:
     for evaluation, paper in zip(found, papers, strict=True):
         cells.append((str(evaluation.nfe), "ours", *ours(evaluation.summary)))
         if paper is not None:
-            cells.append((str(evaluation.nfe), "paper", *printed(paper)))
+            cells.append((str(evaluation.nfe), "paper", *of_paper(paper)))
     note = (
         f"Seeds {summary['seeds'][0]} to {summary['seeds'][1]}, weights of step {summary['checkpoint_step']}, "
         f"{summary['protocol']['task']} ({summary['protocol']['variant']}); {machine(summary)}. "
@@ -63,37 +64,17 @@ def paper_of(evaluation: Evaluation) -> PaperRow | None:
     return evaluation.row.paper if evaluation.row else None
 
 
-def ours(summary: dict[str, Any]) -> tuple[str, ...]:
+def ours(summary: Mapping[str, Any]) -> tuple[str, ...]:
     """The cells of a summary, in the order of COLUMNS[2:]."""
-    episodes = summary["episodes"]
-    return (
-        number(summary["avg_return"], 2),
-        number(summary["median_return"], 1),
-        number(summary["mean_max_reward"], 2),
-        f"{summary['nonzero_episodes']}/{episodes}",
-        f"{summary['success_episodes']}/{episodes}",
-        percent(*summary["success_interval"]),
-        number(summary["inference_ms_mean"], 3),
-        number(summary["inference_ms_p95"], 3),
-        number(summary["inference_fps"], 2),
-        number(summary["control_fps"], 0),
-    )
+    cells = [alone(metric, summary) for metric in SHOWN]
+    return (*cells[:BEHIND], percent(*summary["success_interval"]), *cells[BEHIND:])
 
 
-def printed(paper: PaperRow) -> tuple[str, ...]:
+def of_paper(paper: PaperRow) -> tuple[str, ...]:
     """The cells of a row of the paper, in the order of COLUMNS[2:]."""
-    return (
-        number(paper.avg_reward, 2),
-        number(paper.median, 1),
-        number(paper.avg_max, 2),
-        f"{paper.nonzero}/{paper.episodes}",
-        f"{paper.success}/{paper.episodes}",
-        percent(*wilson_interval(paper.success, paper.episodes)),
-        number(paper.latency_ms, 3),
-        NOTHING,
-        number(paper.inference_fps, 3),
-        NOTHING,
-    )
+    cells = [printed(metric, paper) for metric in SHOWN]
+    interval = percent(*wilson_interval(paper.success, paper.episodes))
+    return (*cells[:BEHIND], interval, *cells[BEHIND:])
 
 
 def percent(low: float, high: float) -> str:
@@ -116,6 +97,6 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "nfe": evaluation.nfe,
         "checkpoint_step": evaluation.summary["checkpoint_step"],
         "seeds": evaluation.summary["seeds"],
-        "ours": {key: evaluation.summary[key] for key in METRICS},
+        "ours": {key: evaluation.summary.get(key) for key in IN_JSON},
         "paper": asdict(paper) if paper else None,
     }

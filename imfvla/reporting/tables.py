@@ -1,56 +1,26 @@
 """The tables, ours beside the paper's printed values, and the evaluations that are in none of them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from imfvla.reporting.cells import BY_NAME, SHOWN, TITLES, printed, with_its_interval
 from imfvla.reporting.comparisons import Compared
 from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
+from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
-from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, interval, number, with_interval
+from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.storage.run_directory import LAST
 
-COLUMNS = (
-    "Row", "nfe", "Source", "Avg. reward", "Median", "Avg. max", "Nonzero", "Success-like", "Latency ms", "p95 ms",
-    "Inf. FPS", "Control FPS",
-)  # fmt: skip
-PRINTED = {  # compared metric -> field of a printed row
-    "avg_return": "avg_reward",
-    "success_episodes": "success",
-    "inference_ms_mean": "latency_ms",
-    "inference_fps": "inference_fps",
-}
-DATA = {  # column of the CSV -> metric and digits; with an interval also its ends
-    "avg_reward": ("avg_return", 4),
-    "median": ("median_return", 4),
-    "iqm": ("iqm_return", 4),
-    "avg_max": ("mean_max_reward", 4),
-    "max": ("max_return", 4),
-    "nonzero": ("nonzero_episodes", 0),
-    "nonzero_share": ("nonzero_share", 6),
-    "success": ("success_episodes", 0),
-    "success_share": ("success_share", 6),
-    "latency_ms": ("inference_ms_mean", 4),
-    "latency_ms_median": ("inference_ms_median", 4),
-    "latency_ms_p95": ("inference_ms_p95", 4),
-    "inference_fps": ("inference_fps", 4),
-    "control_fps": ("control_fps", 4),
-}
-WITHOUT_INTERVAL = ("max", "nonzero", "success", "latency_ms_median", "latency_ms_p95", "control_fps")
-PRINTED_FIELDS = (
-    "avg_reward",
-    "median",
-    "avg_max",
-    "nonzero",
-    "success",
-    "episodes",
-    "latency_ms",
-    "inference_fps",
-)
+COLUMNS = ("Row", "nfe", "Source", *TITLES)
+SUCCESS = BY_NAME["success_episodes"].title
+PRINTED_FIELDS = [field.name for field in fields(PaperRow)][
+    3:
+]  # what it has beside table, method and setting
 INTERVALS = (
     "In brackets: 95% intervals; of counts Wilson's, of means and medians BCa bootstrap over episodes, with several "
     "training seeds over these too. Latency: mean over all replannings, numpy to numpy."
@@ -80,7 +50,7 @@ def row_table(
             row.label,
             NOTHING,
             "published",
-            *(f"{row.success_percent:g}%" if c == "Success-like" else NOTHING for c in COLUMNS[3:]),
+            *(f"{row.success_percent:g}%" if c == SUCCESS else NOTHING for c in COLUMNS[3:]),
         )
         for row in published
     ]
@@ -88,7 +58,14 @@ def row_table(
     notes = (*notes, *dict.fromkeys(f"Published: {row.method}, {row.source}." for row in published))
     for result in results:
         if result.paper:
-            cells.append((result.row.label, str(result.nfe), "paper", *printed(result.paper)))
+            cells.append(
+                (
+                    result.row.label,
+                    str(result.nfe),
+                    "paper",
+                    *(printed(metric, result.paper) for metric in SHOWN),
+                )
+            )
             keys.append(())
         cells.append((result.row.label, str(result.nfe), "ours", *ours(result)))
         keys.append((result.name,))
@@ -141,42 +118,14 @@ def comparison_table(title: str, compared: Sequence[Compared], notes: Sequence[s
     return Document(table, Table(title, *_comparison_data(compared)))
 
 
-def printed(paper: PaperRow) -> tuple[str, ...]:
-    """The cells of a printed row, in the order of COLUMNS[3:]."""
-    return (
-        number(paper.avg_reward, 2),
-        number(paper.median, 1),
-        number(paper.avg_max, 2),
-        f"{paper.nonzero}/{paper.episodes}",
-        f"{paper.success}/{paper.episodes}",
-        number(paper.latency_ms, 3),
-        NOTHING,
-        number(paper.inference_fps, 3),
-        NOTHING,
-    )
-
-
 def ours(result: Result) -> tuple[str, ...]:
     """The cells of a row of ours, in the order of COLUMNS[3:]."""
-    if result.is_missing:
-        return (MISSING,) * len(COLUMNS[3:])
-    metrics = result.metrics
-    return (
-        with_interval(metrics["avg_return"], 2),
-        with_interval(metrics["median_return"], 1),
-        with_interval(metrics["mean_max_reward"], 2),
-        _count(result, "nonzero"),
-        _count(result, "success"),
-        with_interval(metrics["inference_ms_mean"], 3),
-        number(metrics["inference_ms_p95"].value, 3),
-        with_interval(metrics["inference_fps"], 2),
-        number(metrics["control_fps"].value, 0),
-    )
+    return tuple(with_its_interval(metric, result) for metric in SHOWN)
 
 
 def derived(comparison: Comparison, row: PaperRow, baseline: PaperRow) -> str:
     """A result of Table 3 from two printed rows, as the paper prints it: "1.76×" or "+15"."""
-    column = PRINTED[comparison.of]
+    column = BY_NAME[comparison.of].printed
     value, against = getattr(row, column), getattr(baseline, column)
     if value is None or against is None:
         return NOTHING
@@ -200,12 +149,6 @@ def p_value(p: float | None) -> str:
     if p is None:
         return NOTHING
     return "<0.001" if p < 0.0005 else f"{p:.3f}"
-
-
-def _count(result: Result, name: str) -> str:
-    metrics = result.metrics
-    count = f"{metrics[f'{name}_episodes'].value}/{len(result.episodes)}"
-    return f"{count} {interval(metrics[f'{name}_share'].scaled(100), 1, '%')}"
 
 
 def _weights(result: Result) -> str:
@@ -240,8 +183,9 @@ def _data(results: Sequence[Result]) -> tuple[tuple[str, ...], tuple[tuple[str, 
         "training_seeds",
         "episodes",
     ]
-    for name in DATA:
-        columns += [name] if name in WITHOUT_INTERVAL else [name, f"{name}_low", f"{name}_high"]
+    for metric in METRICS:
+        ends = ("", "_low", "_high") if metric.estimate else ("",)
+        columns += [f"{metric.column}{end}" for end in ends]
     columns += [*(f"paper_{name}" for name in PRINTED_FIELDS), "status", "command"]
     return tuple(columns), tuple(_data_row(result) for result in results)
 
@@ -260,12 +204,10 @@ def _data_row(result: Result) -> tuple[str, ...]:
         " ".join(str(evaluation.training_seed) for evaluation in evaluations),
         str(len(result.episodes)) if first else "",
     ]
-    for name, (metric, digits) in DATA.items():
-        measured = result.metrics[metric]
-        numbers = (
-            [measured.value] if name in WITHOUT_INTERVAL else [measured.value, measured.low, measured.high]
-        )
-        cells += ["" if value is None else f"{value:.{digits}f}" for value in numbers]
+    for metric in METRICS:
+        measured = result.metrics[metric.name]
+        numbers = (measured.value, measured.low, measured.high) if metric.estimate else (measured.value,)
+        cells += ["" if value is None else f"{value:.{metric.data_digits}f}" for value in numbers]
     for name in PRINTED_FIELDS:
         value = getattr(result.paper, name) if result.paper else None
         cells.append("" if value is None else str(value))

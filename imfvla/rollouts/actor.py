@@ -16,6 +16,7 @@ from imfvla.environment import Environment
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.episode import Decision
 from imfvla.policy import Policy
+from imfvla.policy.noise import chunk_noise
 from imfvla.rollouts.ensemble import TemporalEnsemble
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.types import Observation, tokenize
@@ -116,10 +117,9 @@ class ChunkActor:
             state=torch.from_numpy(np.stack(states)).unsqueeze(0).to(self._device),
             instruction=self._instruction,
         )
-        draw = np.random.default_rng(np.random.SeedSequence([self._noise_seed, self._seed, replanning]))
-        normal = draw.standard_normal(self._policy.noise_shape, dtype=np.float32)
-        noise = self._noise_scale * torch.from_numpy(normal)
-        chunk = self._policy.predict(observation, noise.unsqueeze(0).to(self._device), self._nfe)
+        place = (self._noise_seed, self._seed, replanning)
+        noise = self._noise_scale * chunk_noise(self._policy.noise_shape, [place])
+        chunk = self._policy.predict(observation, noise.to(self._device), self._nfe)
         answer = chunk[0].float().cpu().numpy()  # waits for an accelerator
         return answer, 1e3 * (time.perf_counter() - began)
 

@@ -12,7 +12,8 @@ from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.process.progress import Progress
 from imfvla.process.workers import Here, Pool, worker_pool
-from imfvla.reporting.metrics import Row, summarise
+from imfvla.reporting.metrics import summarise
+from imfvla.reporting.rows import Row
 from imfvla.rollouts.rollout_log import RolloutLog
 from imfvla.rollouts.workbench import Build, Job, describe_world, load_workbench, record, roll_out
 from imfvla.storage.fingerprint import fingerprint, physical_cores

@@ -14,6 +14,7 @@ from imfvla.config.protocol import EvaluationOptions
 from imfvla.data import Windows
 from imfvla.errors import UserError
 from imfvla.policy import Policy
+from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
 from imfvla.reporting.offline import FILE, HOLD, NEAREST, read_offline
 from imfvla.robot import RobotSpec, bare_name
@@ -115,13 +116,9 @@ def _predicted(
         for first in range(0, len(chosen), ROWS):
             indices = chosen[first : first + ROWS]
             observation = windows.batch(indices, np.random.default_rng(0)).obs.to(options.device)
-            seeds = (np.random.SeedSequence([options.noise_seed, int(index)]) for index in indices)
-            noise = [
-                np.random.default_rng(seed).standard_normal(policy.noise_shape, dtype=np.float32)
-                for seed in seeds
-            ]
-            scaled = options.noise_scale * torch.from_numpy(np.stack(noise))
-            chunks.append(policy.predict(observation, scaled.to(options.device), nfe).float().cpu().numpy())
+            drawn = chunk_noise(policy.noise_shape, [(options.noise_seed, index) for index in indices])
+            noise = (options.noise_scale * drawn).to(options.device)
+            chunks.append(policy.predict(observation, noise, nfe).float().cpu().numpy())
             for _ in indices:
                 bar.advance()
     found = np.concatenate(chunks)

@@ -12,7 +12,7 @@ from typing import Any
 from imfvla.config.protocol import as_recorded
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import read_row
-from imfvla.reporting.metrics import Row
+from imfvla.reporting.rows import Row
 from imfvla.storage.documents import parse_json, read_json
 from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
 from imfvla.storage.fingerprint import code_version

@@ -12,7 +12,7 @@ import torch
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
 from imfvla.environments.rollout import run_episode
-from imfvla.reporting.metrics import Row, row_of, untimed
+from imfvla.reporting.rows import Row, row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.storage.run_directory import RunDirectory
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 from imfvla import tasks
-from imfvla.config.views import ViewOptions
+from imfvla.config.views import view_options
 from imfvla.environment import Environment
 from imfvla.environments import BIMANUAL, GYMNASIUM, KIND, environment_of, kind_of
 from imfvla.episode import Actor
@@ -127,12 +127,9 @@ def settings_of(
     task: Mapping[str, Any], observation: Mapping[str, Any], camera_every: int, where: str
 ) -> Settings:
     """The checked settings of a collection; `where` is the key of `camera_every`. Raises UserError."""
-    seen = {
-        key: part_of({"observation": observation}, f"observation.{key}") for key in ("views", "image_size")
-    }
-    shown = build(ViewOptions, seen, "observation")
+    shown = view_options({"observation": observation})
     if kind_of(task) == GYMNASIUM:
-        return _gymnasium_settings(task, seen, camera_every, where)
+        return _gymnasium_settings(task, asdict(shown), camera_every, where)
     if kind_of(task) != BIMANUAL:
         raise UserError(
             f"{KIND}={kind_of(task)} has no scripted expert, and so no demonstrations to collect: name recordings or a "

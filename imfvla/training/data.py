@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.config.horizon import Horizon
-from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
+from imfvla.config.views import view_options
+from imfvla.data import FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
 from imfvla.options import build
 from imfvla.process.progress import Progress
@@ -14,6 +15,7 @@ from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.opening import source_kind
 from imfvla.sources.same_robot import refuse_other_data
+from imfvla.training.experiment import ExperimentOptions
 
 STORES = Path("data/frames")  # of sources that are no folder of recordings
 DIGITS = 12  # of a source's digest in the name of its store
@@ -26,13 +28,13 @@ def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows
     """
     robot = robot_of(config)
     refuse_other_source(config, source)
-    observation = config["observation"]
+    seen = view_options(config)
     with _DecodingProgress() as progress:
         store = FrameStore.build(
             source,
             store_path(config, source),
-            observation["image_size"],
-            observation["views"],
+            seen.image_size,
+            seen.views,
             progress=progress,
         )
     kept = held_out(config["task"], len(source))
@@ -52,7 +54,7 @@ def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> Non
     refuse_other_data(
         robot_of(config),
         source.robot,
-        config["observation"]["views"],
+        view_options(config).views,
         of="the task",
         where=f"The data of demos.source={source_kind(config)}",
         remedy="Choose data or a task of the same robot.",
@@ -61,7 +63,7 @@ def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> Non
 
 def store_path(config: Mapping[str, Any], source: EpisodeSource) -> Path:
     """Where decoded frames lie: in `demos.frames_directory`, or beside a folder of recordings, or in `data/frames`."""
-    height, width = config["observation"]["image_size"]
+    height, width = view_options(config).image_size
     chosen = config["demos"].get("frames_directory")
     if isinstance(source, McapSource):
         directory, name = source.recordings.directory.parent, source.recordings.name
@@ -70,11 +72,10 @@ def store_path(config: Mapping[str, Any], source: EpisodeSource) -> Path:
     return Path(chosen or directory) / f"{name}_frames_{height}x{width}"
 
 
-def make_loader(config: Mapping[str, Any], windows: Windows) -> Loader:
+def make_loader(options: ExperimentOptions, windows: Windows) -> Loader:
     """Augmented batches that depend only on the seed and their number."""
-    augmentation = build(Augmentation, config["augmentation"], "augmentation")
-    sampler = ResumableSampler(len(windows), config["training"]["batch_size"], config["seed"])
-    return Loader(windows, sampler, augment=augmentation, prefetch=config["training"]["prefetch"])
+    sampler = ResumableSampler(len(windows), options.training.batch_size, options.seed)
+    return Loader(windows, sampler, augment=options.augmentation, prefetch=options.training.prefetch)
 
 
 class _DecodingProgress:

@@ -12,7 +12,7 @@ from imfvla.command.completion import is_complete
 from imfvla.command.composition import CONFIG_DIRECTORY
 from imfvla.command.sweep import Planned, _Sweep, jobs_of_rows, waves
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.metrics import untimed
+from imfvla.reporting.rows import untimed
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory
 from imfvla.storage.run_names import run_key, run_name
 

@@ -146,7 +146,7 @@ def test_an_episode_with_a_label_is_recorded_whole(tmp_path):
 
 
 def test_equal_seeds_give_equal_rows():
-    from imfvla.reporting.metrics import row_of, untimed
+    from imfvla.reporting.rows import row_of, untimed
 
     rows = [json.dumps(untimed(row_of(play(ScriptedActor(), seed=2)))) for _ in range(2)]
     assert rows[0] == rows[1]

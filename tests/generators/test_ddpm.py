@@ -86,6 +86,11 @@ def test_levels_trail_from_the_noisiest_one(nfe, levels):
     assert trailing_levels(LEVELS, nfe) == levels
 
 
+@pytest.mark.parametrize(("nfe", "levels"), [(1, [99]), (2, [99, 29]), (4, [99, 76, 52, 29])])
+def test_the_last_of_several_steps_starts_at_a_given_share_of_the_levels(nfe, levels):
+    assert trailing_levels(100, nfe, 0.3) == levels
+
+
 @pytest.mark.parametrize("nfe", [1, 2, 3, 10, 99, 100])
 @pytest.mark.parametrize("clip", [1.0, 1e6])
 def test_sampling_equals_the_plain_version(nfe, clip):

@@ -6,7 +6,7 @@ from closed_forms import MEAN, STD, STEPS, Context, GaussianFlow, Recorded, draw
 from torch import nn
 
 from imfvla.errors import UserError
-from imfvla.generators.base import BetaTimes, UniformTimes
+from imfvla.generators.base import BetaTimes, UniformTimes, step_times
 from imfvla.generators.flow import FlowMatching
 from imfvla.generators.imf import ImprovedMeanFlow
 
@@ -48,6 +48,18 @@ def test_many_steps_give_samples_and_the_error_halves_with_the_step():
     )
     assert coarse < 0.1
     assert abs(fine / coarse - 0.5) < 0.05
+
+
+def test_the_last_of_several_steps_starts_where_it_is_told():
+    assert step_times(1, 0.3).tolist() == [1, 0]
+    assert step_times(2, 0.3).tolist() == pytest.approx([1, 0.3, 0])
+    assert step_times(3, 0.2).tolist() == pytest.approx([1, 0.6, 0.2, 0])
+    assert step_times(4).tolist() == [1, 0.75, 0.5, 0.25, 0]
+    noise, _, _ = draw()
+    ones, low, flow = torch.ones(len(noise)), torch.full((len(noise),), 0.3), GaussianFlow()
+    z = noise - 0.7 * flow(noise, ones, ones, None)
+    expected = z - 0.3 * flow(z, low, low, None)
+    torch.testing.assert_close(generator(last_step=0.3).sample(flow, None, noise, 2), expected)
 
 
 @pytest.mark.parametrize("nfe", [1, 2, 100])

@@ -147,35 +147,17 @@ def test_encoder_and_instantaneous_velocity_learn_first_and_the_average_afterwar
 
 
 @pytest.mark.parametrize("parametrisation", ["velocity", "data"])
-def test_the_first_step_goes_along_the_average_and_the_others_along_v(parametrisation):
-    """An average that is off by 1 everywhere moves the first step's end by its length."""
+def test_more_steps_than_one_follow_v_where_the_average_is_of_the_whole_interval_alone(parametrisation):
+    """An average that is off by 1 everywhere shows in the one step that is taken with it."""
     noise, _, _ = draw(8)
-    off, exact = ExactFlow(parametrisation, off=1.0), ExactFlow(parametrisation)
+    core, flow = ExactFlow(parametrisation, off=1.0), ExactFlow(parametrisation)
     whole = generator(parametrisation=parametrisation, boundary_share=1.0)
-    end = MEAN + STD * noise
-    torch.testing.assert_close(whole.sample(off, None, noise, 1), end - 1)
-    line = noise - (noise - end) / 4
-    by_hand = whole.follow(whole.instant_core(exact), None, line, torch.tensor([0.75, 0.5, 0.25, 0.0]))
-    torch.testing.assert_close(whole.sample(exact, None, noise, 4), by_hand)
-    torch.testing.assert_close(whole.sample(off, None, noise, 400), end, rtol=0, atol=0.02)
-
-
-@pytest.mark.parametrize("parametrisation", ["velocity", "data"])
-def test_all_steps_take_the_average_where_it_has_learned_parts_of_the_interval(parametrisation):
-    noise, _, _ = draw(8)
-    parts = generator(parametrisation=parametrisation, boundary_share=0.9)
     exact = MEAN + STD * noise
-    assert (parts.sample(ExactFlow(parametrisation, off=1.0), None, noise, 2) - exact).abs().min() > 0.3
-    torch.testing.assert_close(parts.sample(ExactFlow(parametrisation), None, noise, 2), exact)
-
-
-def test_weights_without_an_average_take_all_steps_along_v():
-    noise, _, _ = draw(8)
-    gen = generator(boundary_share=1.0)
-    gen.begin_step(Core(), 0, 2)
-    torch.testing.assert_close(
-        gen.sample(ExactFlow(off=1.0), None, noise, 2), gen.sample(ExactFlow(), None, noise, 2)
-    )
+    torch.testing.assert_close(whole.sample(core, None, noise, 1), exact - 1)
+    torch.testing.assert_close(whole.sample(core, None, noise, 400), exact, rtol=0, atol=0.02)
+    parts = generator(parametrisation=parametrisation, boundary_share=0.9)
+    assert (parts.sample(core, None, noise, 2) - exact).abs().min() > 0.3
+    torch.testing.assert_close(parts.sample(flow, None, noise, 2), exact)
 
 
 @pytest.mark.parametrize(
@@ -198,3 +180,13 @@ def test_one_step_needs_weights_of_the_second_stage():
         gen.check_nfe(1)
     gen.begin_step(Core(), 3, 4)
     gen.check_nfe(1)
+
+
+def test_one_step_learns_what_the_path_s_own_steps_give():
+    """Of an uneven path too: noise less the learned mean velocity is where v ends in as many steps."""
+    noise, _, _ = draw(8)
+    gen = generator(boundary_share=1.0, path_steps=3, last_step=0.2)
+    start, end = torch.ones(8).to(noise), torch.zeros(8).to(noise)
+    learned = noise - gen.path_velocity(ExactFlow(), noise, end, start, None)
+    torch.testing.assert_close(learned, gen.sample(ExactFlow(), None, noise, 3))
+    assert (learned - gen.sample(ExactFlow(), None, noise, 4)).abs().max() > 1e-3

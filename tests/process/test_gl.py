@@ -9,10 +9,10 @@ import pytest
 
 from imfvla.errors import UserError
 from imfvla.process import gl, gl_probe
-from imfvla.process.gl import Answer
+from imfvla.process.gl import Probed
 
 ROOT = Path(__file__).resolve().parents[2]
-DRAWS, MISSING = Answer(devices=1), Answer(problem="its library cannot be loaded")
+DRAWS, MISSING = Probed(devices=1), Probed(problem="its library cannot be loaded")
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def clean(monkeypatch):
     return monkeypatch
 
 
-def answers(clean, egl: Answer, osmesa: Answer) -> None:
+def answers(clean, egl: Probed, osmesa: Probed) -> None:
     clean.setattr(gl, "_probe", {"egl": egl, "osmesa": osmesa}.__getitem__)
 
 
@@ -72,8 +72,8 @@ def test_an_unknown_backend_is_named(clean):
     [
         ("GPU-1234", DRAWS, "must be the number of an EGL device, found 'GPU-1234'"),
         ("-1", DRAWS, "found '-1'"),
-        ("7", Answer(devices=2, problem="no EGL device initialises"), r"in 0 \.\.\. 1, .* found '7'"),
-        ("1", Answer(devices=2, problem="no EGL device initialises"), "=1 does not draw .no EGL device"),
+        ("7", Probed(devices=2, problem="no EGL device initialises"), r"in 0 \.\.\. 1, .* found '7'"),
+        ("1", Probed(devices=2, problem="no EGL device initialises"), "=1 does not draw .no EGL device"),
     ],
 )
 def test_a_device_that_is_not_there_is_named_and_osmesa_not_taken_for_it(clean, device, answer, words):

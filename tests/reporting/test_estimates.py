@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from imfvla.reporting import estimates
+from imfvla.reporting.estimates import wilson_interval
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.metrics import wilson_interval
 
 VALUES = np.array([0.0, 0.0, 10.0, 40.0, 50.0, 70.0, 90.0, 2000.0])
 

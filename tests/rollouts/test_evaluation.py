@@ -12,7 +12,7 @@ from fakes import FakeEnvironment, KnownPolicy, build_fakes
 from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
-from imfvla.reporting.metrics import TIMING
+from imfvla.reporting.rows import TIMING
 from imfvla.rollouts import workbench
 from imfvla.rollouts.evaluation import best_median_worst, evaluate
 from imfvla.rollouts.rollout_log import PARTIAL

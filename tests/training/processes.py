@@ -75,20 +75,20 @@ def make_trainer(job: Job, processes: Alone) -> Trainer:
 def composed_parts(job: Job) -> tuple[Any, ...]:
     """The first arguments of a trainer, as the overrides of a job say."""
     from imfvla.command.composition import compose  # here: the tiny policy starts sooner without
-    from imfvla.options import build
     from imfvla.policy import build_policy
     from imfvla.training.data import make_loader, prepare_windows
-    from imfvla.training.options import OptimOptions, TrainingOptions
+    from imfvla.training.experiment import read_experiment
 
     config = compose("train", job.overrides)
+    options = read_experiment(config)
     windows = prepare_windows(config, McapSource.of(job.demos))
     torch.manual_seed(0)
     return (
         build_policy(config, windows.statistics()),
-        make_loader(config, windows),
+        make_loader(options, windows),
         RunDirectory(job.run),
-        build(TrainingOptions, config["training"], "training"),
-        build(OptimOptions, config["optim"], "optim"),
+        options.training,
+        options.optim,
     )
 
 

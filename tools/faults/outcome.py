@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from imfvla.recording import read_episode
-from imfvla.reporting.metrics import untimed
+from imfvla.reporting.rows import untimed
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics

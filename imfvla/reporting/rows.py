@@ -1,0 +1,33 @@
+"""The line of `episodes.jsonl` that an episode becomes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from imfvla.episode import EpisodeResult
+
+Row = Mapping[str, Any]  # one line of episodes.jsonl
+TIMING = "timing"  # key of a row that holds all that differs between equal runs
+
+
+def row_of(result: EpisodeResult) -> dict[str, Any]:
+    """The line of `episodes.jsonl`: plain values; times are under the last key, inference times rounded to 1 us."""
+    return {
+        "seed": result.seed,
+        "start_digest": result.start_digest,
+        "num_steps": result.num_steps,
+        "total_reward": result.total_reward,
+        "max_reward": result.max_reward,
+        "success": bool(result.success),
+        "first_step_of_stage": list(result.first_step_of_stage),
+        "failure": result.failure,
+        **({"goal": result.goal} if result.goal else {}),
+        TIMING: {
+            "wall_s": round(result.wall_s, 6),
+            "inference_ms": [round(value, 3) for value in result.inference_ms],
+        },
+    }
+
+
+def untimed(row: Row) -> dict[str, Any]:
+    """The row without its times: equal for equal runs."""
+    return {key: value for key, value in row.items() if key != TIMING}
