@@ -114,7 +114,7 @@ ONLY = {
     "encoders": "errors nn types",
     "generators": "errors nn options",
     "nn": "errors options storage",
-    "reporting": "config episode errors options robot storage",
+    "reporting": "config episode errors options process robot storage",
     "storage": "config errors options",
 }
 SIMULATE = "tasks gymnasium_env"

@@ -3,8 +3,8 @@
 import logging
 import os
 import traceback
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -39,11 +39,12 @@ INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
 log = logging.getLogger(__name__)
 
 
-def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
+def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequence[str] = ()) -> None:
     """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
 
-    `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
-    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
+    `config` is train.yaml composed under `overrides`, as plain dicts. status.json says running, then done, or failed
+    with the traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be
+    collected.
     """
     options = checked_options(config)
     is_trained = options.training.steps in run.weight_steps()
@@ -60,7 +61,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         if not is_trained:
             processes.check(options.training)
         if processes.is_first:
-            _run_stages(config, options, run, processes)
+            _run_stages(config, options, run, overrides, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, options, run, processes)
 
@@ -82,16 +83,15 @@ def _check_environment(config: Mapping[str, Any]) -> None:
     if kind_of(config["task"]) == BIMANUAL:
         select_gl_backend()
         return
-    env = environment_of(config)
-    refuse_other_robot(
-        robot_of(config),
-        env.robot,
-        view_options(config).views,
-        of="task.robot",
-        where=f"The environment {env.name}",
-        remedy="Correct task.robot.",
-    )
-    env.close()
+    with closing(environment_of(config)) as env:
+        refuse_other_robot(
+            robot_of(config),
+            env.robot,
+            view_options(config).views,
+            of="task.robot",
+            where=f"The environment {env.name}",
+            remedy="Correct task.robot.",
+        )
 
 
 def _check_source(config: Mapping[str, Any]) -> None:
@@ -108,12 +108,17 @@ def _check_source(config: Mapping[str, Any]) -> None:
 
 
 def _run_stages(
-    config: Mapping[str, Any], options: ExperimentOptions, run: RunDirectory, processes: Alone
+    config: Mapping[str, Any],
+    options: ExperimentOptions,
+    run: RunDirectory,
+    overrides: Sequence[str],
+    processes: Alone,
 ) -> None:
     """All stages, except the other processes' shares of training."""
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         _refuse_other_robot(config, run)
+        run.keep_overrides(overrides)
         try:
             is_trained = options.training.steps in run.weight_steps()
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)

@@ -25,7 +25,7 @@ class Media:
         if not path.exists() or (self._is_copied and path.is_dir()):
             return None
         target = self._copy_of(path, run) if self._is_copied else path
-        return quote(Path(os.path.relpath(target, self._directory)).as_posix())
+        return quote(os.fsencode(Path(os.path.relpath(target, self._directory)).as_posix()))
 
     def _copy_of(self, path: Path, run: Path) -> Path:
         checked(path, kind_of(path), home=run)

@@ -28,7 +28,7 @@ class Protocol(TypedDict):
     """Which weights were judged on which episodes."""
 
     checkpoint_step: Step
-    held_out: Annotated[list[int], at_most(MAX_EPISODES)]
+    held_out: Annotated[list[Label], at_most(MAX_EPISODES)]  # names of episodes
 
 
 class Offline(TypedDict):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from imfvla.config.protocol import REPORTING_FIRST_SEED
 from imfvla.errors import UserError
 from imfvla.options import part_of
 from imfvla.reporting.runs import evaluations
@@ -17,6 +18,7 @@ from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
 MAX_BYTES = 8_000_000  # of the weights
 THINNING = 10
+TRAIN = ("python", "-m", "imfvla.train")
 RECORDED = ("depth_attention.json",)  # what tools may have added to a run
 
 
@@ -37,7 +39,9 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
         raise UserError(f"{weights} has {size} bytes: wanted at most {MAX_BYTES}; train a narrower core.")
     reported = [evaluation for evaluation in evaluations(run) if evaluation.is_reporting]
     if not reported:
-        raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
+        raise UserError(
+            f"{run.path} has no evaluation of the reporting band: first_seed={REPORTING_FIRST_SEED}."
+        )
     made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
     recorded = [run.path / name for name in RECORDED if (run.path / name).exists()]
     copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
@@ -67,7 +71,13 @@ def refuse_existing(target: Path) -> None:
 
 
 def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
-    """The command that made a run, from the name of its directory and, where the name lost brackets, its config."""
+    """The command that made a run: as it was recorded, which older runs were not.
+
+    Theirs is read from the name of the directory and, where the name lost brackets, from the config.
+    """
+    recorded = run.overrides()
+    if recorded is not None:
+        return shlex.join([*TRAIN, *recorded])
     values = flatten(config)
     name = "" if run.path.name == "default" else run.path.name
     overrides = []
@@ -75,7 +85,7 @@ def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
         key = text.partition("=")[0]
         value = values.get(key)
         overrides.append(f"{key}=[{','.join(map(str, value))}]" if isinstance(value, list) else text)
-    return shlex.join(["python", "-m", "imfvla.train", f"+exp={part_of(config, 'name')}", *overrides])
+    return shlex.join([*TRAIN, f"+exp={part_of(config, 'name')}", *overrides])
 
 
 def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:

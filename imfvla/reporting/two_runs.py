@@ -11,7 +11,7 @@ from imfvla.reporting.power import ALPHA, POWER
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import rows
 from imfvla.reporting.significance import holm
-from imfvla.reporting.table import NOTHING, REFUSED, Table, with_interval
+from imfvla.reporting.table import NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.reporting.tables import COLUMNS, ours, p_value
 from imfvla.storage.run_directory import RunDirectory
@@ -167,8 +167,8 @@ def _amount(found: ComparedMeasure) -> str:
     if measure.neutral:
         return with_interval(result, measure.digits, measure.unit)
     form = f"+.{measure.digits}f"
-    bounds = "" if result.low is None else f" [{result.low:{form}}, {result.high:{form}}]"
-    return f"{result.value:{form}}{bounds}{measure.unit}"
+    bounds = TOO_FEW if result.low is None else f"[{result.low:{form}}, {result.high:{form}}]"
+    return f"{result.value:{form}} {bounds}{measure.unit}"
 
 
 def _sentence(found: ComparedMeasure) -> str:

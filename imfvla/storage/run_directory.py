@@ -1,6 +1,6 @@
 """The run directory: the contract between training, evaluation and tables. Needs neither torch nor mujoco.
 
-config.yaml  status.json  train.log  metrics.jsonl  tensorboard/
+config.yaml  overrides.json  status.json  train.log  metrics.jsonl  tensorboard/
 checkpoints/last/state.safetensors            to resume from, bit for bit
 checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
 rollouts/<evaluation>/
@@ -11,7 +11,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
@@ -35,6 +35,8 @@ from imfvla.storage.files import (
 from imfvla.storage.opening import WEIGHTS, open_to_append, open_to_read, refuse_strangers
 from imfvla.storage.records import STATES, RunConfig, Status, as_record, read_record
 
+OVERRIDES = "overrides.json"
+REMEDY = "delete it; commands are then read from the directory's name"
 RUNNING, DONE, FAILED = STATES
 PARENTS = 3  # runs/<experiment>/<name>, which Hydra makes without forcing them to disk
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
@@ -165,6 +167,19 @@ class RunDirectory:
                 f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another "
                 "name=..., or delete that directory if it is not needed."
             )
+
+    def keep_overrides(self, overrides: Sequence[str]) -> None:
+        """Records the overrides of the command that began the run, unless there are none or some are kept already."""
+        path = self.path / OVERRIDES
+        if overrides and not path.exists():
+            write_json(path, list(overrides))
+
+    def overrides(self) -> list[str] | None:
+        """Those of `keep_overrides`, None without any. Raises UserError where the file is broken."""
+        path = self.path / OVERRIDES
+        if not path.exists():
+            return None
+        return read_record(path, list[str], REMEDY)
 
     def status(self) -> dict[str, Any]:
         """The content of status.json, {} before the first one. Raises UserError where it is broken."""

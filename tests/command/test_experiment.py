@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 import yaml
+from fakes import FakeEnvironment
 
 from imfvla.command import experiment
 from imfvla.command.composition import compose
@@ -241,3 +242,21 @@ def test_foreign_weights_are_reported_before_anything_is_written(calls, tmp_path
         run_experiment(compose("train", [*TINY, *overrides]), RunDirectory(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     assert calls == []
+
+
+def test_an_environment_that_is_refused_is_closed(monkeypatch):
+    config = compose("train", ["+exp=socket_act"])
+    config["task"]["kind"] = "gymnasium"
+    env = FakeEnvironment()
+    closed = []
+    monkeypatch.setattr(env, "close", lambda: closed.append(env), raising=False)
+    monkeypatch.setattr(experiment, "environment_of", lambda config: env)
+
+    def refuse(*robots, **words):
+        raise UserError("other robots")
+
+    monkeypatch.setattr(experiment, "refuse_other_robot", refuse)
+    monkeypatch.setattr(experiment, "robot_of", lambda config: None)
+    with pytest.raises(UserError, match="other robots"):
+        experiment._check_environment(config)
+    assert closed == [env]

@@ -88,6 +88,17 @@ def test_the_command_has_the_lists_that_the_directory_s_name_shows_without_brack
     assert command_of(RunDirectory(tmp_path / "default"), config) == "python -m imfvla.train +exp=a"
 
 
+def test_the_command_is_the_recorded_one_where_there_is_one(tmp_path):
+    run = make_run(tmp_path / "core=standard")
+    run.keep_overrides(["+exp=b", "core=standard", "training.threads=1"])
+    run.keep_overrides(["+exp=b", "evaluation.nfe=[4]"])  # of a later command that only evaluates
+    command = "python -m imfvla.train +exp=b core=standard training.threads=1"
+    assert command_of(run, {"name": "a"}) == command
+    write_json(run.path / "overrides.json", {"a": 1})
+    with pytest.raises(UserError, match=r"overrides\.json must hold a list of texts, found dict; delete it"):
+        command_of(run, {"name": "a"})
+
+
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
     run = make_run(tmp_path / "run", size=8_000_001)
     write_json(run.path / "depth_attention.json", {})

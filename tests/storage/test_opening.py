@@ -51,7 +51,7 @@ READERS = {
     "policy.safetensors": lambda path: load_weights(nn.Linear(3, 2), path),
     "any.safetensors": read_tensors,
     "store/meta.json": lambda path: FrameStore.open(path.parent),
-    f"rollouts/{PARTIAL}": lambda path: RolloutLog(path.parent, {}).__enter__(),
+    f"rollouts/{PARTIAL}": lambda path: RolloutLog(path.parent, {}).__enter__().begin(),
     "video.mp4": lambda path: copy_file(path, path.parent / "copy" / path.name),
     "train.log": lambda path: RunLog(path),
     ".lock": lambda path: RunDirectory(path.parent).lock().__enter__(),

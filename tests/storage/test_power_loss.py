@@ -162,6 +162,7 @@ def test_a_converted_data_set(tmp_path):
 def evaluate(folder, rows, summary=None, **options):
     """An evaluation that ends with a `summary`, or is interrupted after its rows."""
     with RolloutLog(folder, {"nfe": 1}, **options) as log:
+        log.begin()
         for row in rows[len(log.rows) :]:
             log.append(row)
         if summary:

@@ -1,14 +1,20 @@
 """Parquet files of a LeRobot data set, in bounded memory: only the columns and rows that are asked for."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from imfvla.errors import UserError, unreadable
-from imfvla.sources.checks import MAX_EPISODES, MAX_STEPS, misfit, missing_extra, shortened
+from imfvla.sources.checks import (
+    MAX_EPISODES,
+    MAX_STEPS,
+    misfit,
+    missing_extra,
+    read_errors_told,
+    shortened,
+)
 from imfvla.sources.lerobot.layout import DOWNLOAD, INFO, TASKS, Info
 from imfvla.storage.opening import ANYWHERE, DATA, checked
 
@@ -21,6 +27,8 @@ except ImportError as error:
 
 BATCH = 1024  # rows in memory at a time
 MAX_TASKS, MAX_SENTENCE = 100_000, 10_000
+# What a damaged file makes pyarrow raise.
+OF_DAMAGE = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, OverflowError, RuntimeError)
 MAX_ROW_BYTES = 2 * 2**30  # of the rows of one episode
 MAX_GROUP_VALUES = 2**28  # of a column of a row group: a list of equal numbers takes no space in the file
 
@@ -214,33 +222,19 @@ def _num_rows(path: Path, home: Path) -> int:
     return count
 
 
-@contextmanager
-def clear_errors(path: Path) -> Iterator[None]:
+def clear_errors(path: Path) -> AbstractContextManager[None]:
     """Turns what pyarrow raises into a UserError that tells damage from what is not supported."""
-    try:
-        yield
-    except UserError:
-        raise
-    except FileNotFoundError as error:
-        raise UserError(f"{path} is missing: wanted a parquet file there; {DOWNLOAD}.") from error
-    except PermissionError as error:
-        raise unreadable(path, error) from error
-    except NotImplementedError as error:  # pyarrow's too
-        raise UserError(
-            f"{path} is not supported by pyarrow {pa.__version__} ({shortened(_line(error))}): rewrite it with LeRobot."
-        ) from error
-    except (
-        pa.ArrowException,
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        OverflowError,
-        RuntimeError,
-    ) as error:
-        raise UserError(
-            f"{path} is no whole parquet file ({shortened(_line(error))}); {DOWNLOAD}."
-        ) from error
+    return read_errors_told(
+        path,
+        "a parquet file",
+        DOWNLOAD,
+        # pyarrow's own error of that kind is a NotImplementedError too
+        lambda error: (
+            f"is not supported by pyarrow {pa.__version__} ({shortened(_line(error))}): rewrite it with LeRobot."
+        ),
+        lambda error: f"is no whole parquet file ({shortened(_line(error))}); {DOWNLOAD}.",
+        OF_DAMAGE,
+    )
 
 
 def _line(error: Exception) -> str:
