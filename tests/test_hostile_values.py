@@ -311,7 +311,7 @@ def test_depth_weights_are_what_they_should_be(tmp_path, key, value, message):
 def test_offline_results_are_what_they_should_be(run, key, value, message):
     errors = [[0.1, None], [0.2, 0.4]]
     whole = {
-        "experiment": "x", "protocol": {"checkpoint_step": 3, "held_out": [1]}, "decisions": 5, "executed": 1,
+        "experiment": "x", "protocol": {"checkpoint_step": 3, "held_out": ["demo_1"]}, "decisions": 5, "executed": 1,
         "channels": ["a", "b"], "deviation": [0.5, 0.0],
         "error": {"hold still": errors, "nearest demonstration": errors, "infer1": errors},
     }  # fmt: skip

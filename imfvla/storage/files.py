@@ -136,7 +136,7 @@ def put_folder(part: Path, path: Path) -> None:
 def clear_folder(path: Path) -> None:
     """Brings a folder back that a kill left aside while it was replaced, and deletes what replacements left."""
     old = path.with_name(f".{path.name}{OLD}")
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError, NotADirectoryError):
         gone = path if not os.path.lexists(path) else old.with_suffix(f".{secrets.token_hex(4)}{GONE}")
         os.rename(old, gone)
     for gone in _siblings(path, f".{path.name}.", GONE):

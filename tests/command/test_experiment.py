@@ -122,7 +122,10 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("evaluation.workers=-1", r"evaluation\.workers must be null or between 0 and"),
         ("evaluation.episode_timeout_s=-1", r"evaluation\.episode_timeout_s must be null or above 0"),
         ("evaluation.noise_seed=-1", r"evaluation\.noise_seed must be between 0 and"),
-        ("evaluation.first_seed=18446744073709551616", r"evaluation\.first_seed must be between 0 and"),
+        (
+            "evaluation.first_seed=18446744073709551616",
+            r"evaluation\.first_seed must be a whole number up to",
+        ),
         ("evaluation.checkpoint=3", r"checkpoint must be one of the weights .* of the steps 2, 4, found 3"),
         ("evaluation.checkpoint=half", r"evaluation\.checkpoint must be last, a training step"),
         ("augmentation.brightness=9", r"augmentation\.brightness must be at most 1"),

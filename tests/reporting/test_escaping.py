@@ -238,10 +238,10 @@ def test_links(name, tmp_path):
         pytest.skip("no name of a file")
     file = tmp_path / name
     file.touch()
-    link = Media(tmp_path, is_copied=False).link(file)
+    link = Media(tmp_path, is_copied=False).link(file, tmp_path)
     assert re.fullmatch(r"[A-Za-z0-9_.~%-]+", link)
     assert os.fsdecode(unquote_to_bytes(link)) == name
-    ((tag, attributes), shown) = Reader(anchor(file, Media(tmp_path, is_copied=False))).found
+    ((tag, attributes), shown) = Reader(anchor(file, tmp_path, Media(tmp_path, is_copied=False))).found
     assert (tag, dict(attributes), shown) == ("a", {"href": link}, visible(name))
 
 

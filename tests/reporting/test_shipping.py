@@ -95,7 +95,7 @@ def test_the_command_is_the_recorded_one_where_there_is_one(tmp_path):
     command = "python -m imfvla.train +exp=b core=standard training.threads=1"
     assert command_of(run, {"name": "a"}) == command
     write_json(run.path / "overrides.json", {"a": 1})
-    with pytest.raises(UserError, match=r"overrides\.json must hold a list of texts, found dict; delete it"):
+    with pytest.raises(UserError, match=r"overrides\.json.*must be a list, found .*; delete it"):
         command_of(run, {"name": "a"})
 
 

@@ -60,7 +60,9 @@ def flip(store: Path, rng: random.Random) -> str:
 
 def shift_actions(store: Path, rng: random.Random) -> str:
     path = store / "action.npy"
-    np.save(path, np.load(path) + np.float32(0.2 * rng.random() + 0.01))
+    np.save(
+        path, np.load(path, allow_pickle=False) + np.float32(0.2 * rng.random() + 0.01), allow_pickle=False
+    )
     return path.name
 
 
