@@ -24,7 +24,7 @@ from imfvla.benchmarks.tables import (
     speed_table,
     training_rows,
 )
-from imfvla.command.composition import CONFIG_DIRECTORY, compose
+from imfvla.command.composition import Places, choices_of, compose
 from imfvla.command.entry import entry_point
 from imfvla.options import at_least, build, one_of, require, some, within
 from imfvla.process.progress import Progress
@@ -57,17 +57,17 @@ class BenchOptions:
 def main(config: dict[str, Any]) -> None:
     """Prints the tables of the requested parts, then all figures as one line of JSON."""
     build(BenchOptions, config, "")
-    parts = config["parts"]
+    parts, places = config["parts"], Places.of_command()
     GlobalHydra.instance().clear()  # the experiments are composed below
     result: dict[str, Any] = {}
-    counted = experiments(config["sizes_of"], "sizes_of") if "sizes" in parts else []
-    measured = experiments(config["experiments"], "experiments") if set(parts) != {"sizes"} else []
+    counted = experiments(config["sizes_of"], "sizes_of", places) if "sizes" in parts else []
+    measured = experiments(config["experiments"], "experiments", places) if set(parts) != {"sizes"} else []
     # Composed here, so that a wrong name is reported before anything is measured.
-    composed = [of_measured(name, config) for name in measured]
+    composed = [of_measured(name, config, places) for name in measured]
     for experiment in counted:
-        compose("train", [f"+exp={experiment}"])
+        compose("train", [f"+exp={experiment}"], places)
     if counted:
-        result["sizes"] = sizes(counted, config)
+        result["sizes"] = sizes(counted, config, places)
     if measured:
         figures = map(lambda name, of_name: measure_and_print(name, of_name, config), measured, composed)
         result["figures"] = dict(zip(measured, figures, strict=True))
@@ -79,23 +79,23 @@ def main(config: dict[str, Any]) -> None:
     print(json.dumps({**config, **result, "fingerprint": fingerprint()}))
 
 
-def experiments(wanted: Any, key: str) -> list[str]:
-    """Names of files in conf/exp: those in the list `wanted`, or all of them."""
+def experiments(wanted: Any, key: str, places: Places) -> list[str]:
+    """Names of files in exp/ of `conf` and of these places: those in the list `wanted`, or all of them."""
     if wanted == "all":
-        return sorted(path.stem for path in (CONFIG_DIRECTORY / "exp").glob("*.yaml"))
+        return choices_of("exp", "train", places)
     is_list = isinstance(wanted, list) and bool(wanted) and all(isinstance(name, str) for name in wanted)
     require(is_list, key, "all or a list of experiments", wanted)
     return wanted
 
 
-def sizes(names: Sequence[str], config: Mapping[str, Any]) -> dict[str, Any]:
+def sizes(names: Sequence[str], config: Mapping[str, Any], places: Places) -> dict[str, Any]:
     """Prints the table of sizes and returns its figures, by experiment and scale."""
     from imfvla.benchmarks.sizes import measure_size  # here, since imports take seconds
 
     found: dict[str, dict[str, Any]] = {}
     with Progress("sizes", len(names) * len(SCALES)) as bar:
         for name, scale in product(names, SCALES):
-            composed = compose("train", [f"+exp={name}", f"scale={scale}"])
+            composed = compose("train", [f"+exp={name}", f"scale={scale}"], places)
             found.setdefault(name, {})[scale] = measure_size(composed, evaluations(composed, config))
             bar.advance(f"{name} at scale {scale}")
     size_table([(name, scale, size) for name in found for scale, size in found[name].items()]).print()
@@ -107,9 +107,10 @@ def evaluations(composed: Mapping[str, Any], config: Mapping[str, Any]) -> list[
     return config["nfe"] or composed["evaluation"]["nfe"]
 
 
-def of_measured(experiment: str, config: Mapping[str, Any]) -> dict[str, Any]:
+def of_measured(experiment: str, config: Mapping[str, Any], places: Places) -> dict[str, Any]:
     """The composed experiment whose speed is measured."""
-    return compose("train", [f"+exp={experiment}", f"scale={config['at_scale']}", *config["overrides"]])
+    overrides = [f"+exp={experiment}", f"scale={config['at_scale']}", *config["overrides"]]
+    return compose("train", overrides, places)
 
 
 def measure_and_print(

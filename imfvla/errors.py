@@ -36,11 +36,11 @@ WHERE_MISSING = {errno.ENOENT: "check that its parent directories exist"}
 
 
 def as_user_error(error: BaseException, remedies: dict[int, str] = REMEDIES) -> UserError | None:
-    """A UserError itself, or one for a system error or for an error that it caused; None for other errors."""
-    if isinstance(error, UserError):
-        return error
+    """A UserError, or one for a system error, which either raised or caused this error; None for other errors."""
     cause: BaseException | None = error
     while cause is not None:
+        if isinstance(cause, UserError):
+            return cause
         if isinstance(cause, OSError) and isinstance(cause.__context__, UserError) and not cause.filename:
             return cause.__context__  # closing the file met the same error again, without the file's name
         if isinstance(cause, OSError) and cause.errno in remedies:

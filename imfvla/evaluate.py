@@ -20,6 +20,7 @@ def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.reporting.table_row import print_row
     from imfvla.rollouts.evaluation import evaluate
+    from imfvla.training.checkpoint import check_weights
 
     require(config["run"] is None or isinstance(config["run"], str), "run", "a directory", config["run"])
     if not config["run"]:
@@ -34,6 +35,7 @@ def main(config: dict[str, Any]) -> None:
         evaluate_offline(run, trained, options)
         print_offline(run)
         return
+    check_weights(run, options.checkpoint)
     summaries = evaluate(run, options)
     folders = [run.rollouts(summary["name"]) for summary in summaries]
     print_row(run, only=[folder.name for folder in folders])

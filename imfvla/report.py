@@ -11,7 +11,7 @@ from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 
-from imfvla.command.composition import compose
+from imfvla.command.composition import Places, compose
 from imfvla.command.entry import entry_point
 from imfvla.options import build
 from imfvla.robot_of import has_environment
@@ -51,8 +51,9 @@ def main(config: dict[str, Any]) -> None:
 
     mapping = read_mapping(Path(options.mapping) if options.mapping else PATH)
     directories = [Path(directory) for directory in options.directories]
+    places = Places.of_command()
     GlobalHydra.instance().clear()  # the method is composed below
-    method = compose("train", options.method)
+    method = compose("train", options.method, places)
     publication = publish(directories, Path(options.output), mapping, method, media=options.media)
     paths = publication.write()
     for table in publication.tables:

@@ -17,7 +17,8 @@ from imfvla.options import build, require
 
 MAX_CHANNELS = 1000
 MAX_CAMERAS = 64
-MAX_CONTROL_HZ = 10_000.0
+MIN_CONTROL_HZ, MAX_CONTROL_HZ = 0.01, 10_000.0
+MAX_SIDE = 16_384  # of a picture [px]
 UNIT = re.compile(r"(.*\S) \[([^\[\]]*)\]")  # "left/joint_1 [rad]"
 
 
@@ -91,9 +92,9 @@ class RobotSpec:
                 (low, high),
             )
         require(
-            0 < self.control_hz <= MAX_CONTROL_HZ,
+            MIN_CONTROL_HZ <= self.control_hz <= MAX_CONTROL_HZ,
             "robot.control_hz",
-            f"above 0, up to {MAX_CONTROL_HZ:g}",
+            f"from {MIN_CONTROL_HZ:g} to {MAX_CONTROL_HZ:g}",
             self.control_hz,
         )
         names = [camera.name for camera in self.cameras]
@@ -101,9 +102,9 @@ class RobotSpec:
         require(len(set(names)) == len(names), "robot.cameras", "names that all differ", names)
         for camera in self.cameras:
             require(
-                min(camera.height, camera.width) > 0,
+                0 < min(camera.height, camera.width) <= max(camera.height, camera.width) <= MAX_SIDE,
                 f"robot.cameras.{camera.name}",
-                "a positive size",
+                f"of 1 to {MAX_SIDE} pixels a side",
                 camera,
             )
 

@@ -10,6 +10,8 @@ if __name__ == "__main__":
 
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+
 from imfvla.command.completion import is_complete
 from imfvla.command.composition import CONFIG_DIRECTORY
 from imfvla.command.entry import entry_point, output_directory
@@ -30,7 +32,8 @@ def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.command.experiment import run_experiment
 
-    run_experiment(config, RunDirectory(output_directory()))
+    overrides = list(HydraConfig.get().overrides.task)
+    run_experiment(config, RunDirectory(output_directory()), overrides)
 
 
 if __name__ == "__main__":

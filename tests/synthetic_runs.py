@@ -62,12 +62,13 @@ def write_evaluation(
 ) -> Path:
     """A finished evaluation in `run`; returns its folder. `protocol` changes what summary.json says of it."""
     rows = episodes_of(quality, first_seed, number, task=task, latency_ms=latency_ms, stream=stream)
-    name = yaml.safe_load((run / "config.yaml").read_text())["name"]
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    name, weights = config["name"], f"{config.get('seed', 0):016x}"
     seeds = [first_seed, first_seed + number - 1]
     summary = summarise(rows) | {
         "experiment": name, "nfe": nfe, "checkpoint_step": step, "seeds": seeds,
         "protocol": {
-            "task": task, "variant": "default", "checkpoint_step": step, "weights": "0" * 16, "nfe": nfe,
+            "task": task, "variant": "default", "checkpoint_step": step, "weights": weights, "nfe": nfe,
             "noise_seed": 0, "first_seed": first_seed, "episodes": number, "max_steps": None, "device": "cpu",
         } | protocol,
         "fingerprint": {"code": CODE, "machine": machine or MACHINE, "threads": 1, "workers": 2},

@@ -90,8 +90,10 @@ def test_commands_in_documents_compose_and_build(command):
 LAYERS = [
     "errors types",
     "options process",
-    "config nn robot",
-    "encoders environment generators storage",
+    "config robot",
+    "storage",
+    "nn",
+    "encoders environment generators",
     "episode",
     "gymnasium_env reporting tasks",
     "environments recording",
@@ -111,8 +113,8 @@ LAYER = {room: number for number, rooms in enumerate(LAYERS) for room in rooms.s
 ONLY = {
     "encoders": "errors nn types",
     "generators": "errors nn options",
-    "nn": "errors options",
-    "reporting": "config episode errors options robot storage",
+    "nn": "errors options storage",
+    "reporting": "config episode errors options process robot storage",
     "storage": "config errors options",
 }
 SIMULATE = "tasks gymnasium_env"

@@ -110,7 +110,7 @@ def test_a_row_s_number_is_that_of_its_episodes(runs, tmp_path, method, unrender
     [
         (lambda runs: cut(runs, "episodes.jsonl"), r"episodes\.jsonl, line 100 is cut off"),
         (lambda runs: cut(runs, "summary.json"), r"summary\.json cannot be read as JSON"),
-        (lambda runs: cut(runs, "metrics.jsonl", keep='{"st\n'), r"metrics\.jsonl, line 1 is no row of metrics"),
+        (lambda runs: cut(runs, "metrics.jsonl", keep='{"st\n'), r"metrics\.jsonl, line 1 is not JSON"),
         (lambda runs: answer_row(runs / "again", ROWS["socket_infer2"]), r"row 4 \(socket_infer2\) is answered twice"),
         (lambda runs: answer_row(runs, ROWS["socket_act"], number=30), r"row 6 \(socket_act\) needs another protocol"),
         (lambda runs: answer_row(runs, ROWS["socket_act"], variant="hard"), r"table1 mixes protocols: variant is"),

@@ -52,7 +52,7 @@ def test_a_view_without_a_camera_is_named():
 def test_a_wrongly_stated_robot_is_named_with_its_key():
     config = compose("train")
     config["task"]["robot"] = robot_of_size(7, 7).to_json() | {"control_hz": 0}
-    with pytest.raises(UserError, match=r"control_hz must be above 0"):
+    with pytest.raises(UserError, match=r"control_hz must be from 0.01 to 10000"):
         robot_of(config)
     config["task"]["robot"] = {"state": ["a"]}
     with pytest.raises(UserError, match=r"Missing key task\.robot\.cameras"):

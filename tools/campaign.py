@@ -35,6 +35,7 @@ from imfvla.errors import UserError
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped
 from imfvla.reporting.shipping import ship
+from imfvla.storage.files import put_folder
 from imfvla.storage.run_directory import RunDirectory
 
 RESULTS, LOGS = Path("experiments/results"), Path("runs/campaign")
@@ -159,8 +160,7 @@ def keep(policy: Policy) -> dict[str, object]:
     fresh = policy.target.with_name(f".{policy.target.name}.new")
     shutil.rmtree(fresh, ignore_errors=True)
     made_by = ship(RunDirectory(policy.directory), fresh, with_weights=False)
-    shutil.rmtree(policy.target, ignore_errors=True)
-    fresh.rename(policy.target)
+    put_folder(fresh, policy.target)
     return made_by
 
 

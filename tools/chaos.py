@@ -11,6 +11,13 @@ stops                              Ctrl-C, SIGTERM and SIGUSR1 in the middle of 
 disk                               a full file system, a read-only one (both mounted, where permitted) and no file
                                    handles left
 workers                            worker processes that die and hang in the middle of an evaluation
+changes                            data, rows, numbers, config, weights and code that change silently
+leftovers                          SIGKILL within the writing of a state, always; what is left is counted
+strangers                          a link that leads out, a pipe, a socket, a device, a directory or 8 GB of zeros in
+                                   place of a file of a run directory, four times as often
+publications                       four commands that publish into one folder at once
+no_locks                           a file system without locks
+nfs                                frame stores that are replaced while in use, where open files cannot be deleted
 
 Processes are forked after everything is imported, so that the signals hit the work itself. The policy is the tiny one
 of the tests (in a sweep a small one that is composed), and its environment replaces the simulator; loop,
@@ -35,10 +42,14 @@ import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "tests"), str(ROOT / "tests" / "training")]
+from faults.changes import changes  # noqa: E402
 from faults.disk import disk  # noqa: E402
 from faults.killing import kills_of  # noqa: E402
+from faults.leftovers import leftovers  # noqa: E402
 from faults.outcome import Differs, demonstrations_of, rows_of, state_of  # noqa: E402
+from faults.sharing import nfs, no_locks, publications  # noqa: E402
 from faults.stops import stops  # noqa: E402
+from faults.strangers import strangers  # noqa: E402
 from faults.sweep import sweep  # noqa: E402
 from faults.torchrun import torchrun  # noqa: E402
 from faults.work import collect, roll_out, train  # noqa: E402
@@ -53,6 +64,12 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "stops": stops,
     "disk": disk,
     "workers": workers,
+    "changes": changes,
+    "leftovers": leftovers,
+    "strangers": strangers,
+    "publications": publications,
+    "no_locks": no_locks,
+    "nfs": nfs,
 }
 
 

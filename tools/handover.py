@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imfvla.config.protocol import REPORTING_FIRST_SEED
 from imfvla.environments.rollout import run_episode
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.modes.grippers import grippers_of, release_delay
@@ -45,7 +46,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path, help="directory of a trained run of the transfer task")
     parser.add_argument("--nfe", type=int, default=1, help="network steps per chunk")
-    parser.add_argument("--first-seed", type=int, default=100_000, help="of the start states")
+    parser.add_argument("--first-seed", type=int, default=REPORTING_FIRST_SEED, help="of the start states")
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
     env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())

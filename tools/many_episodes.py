@@ -75,7 +75,8 @@ def prepare(episodes: int, folder: Path) -> tuple[dict[str, Any], Drawn, dict[st
 
 def write_store(episodes: int, folder: Path) -> None:
     """The arrays of a frame store: walks, actions that follow them, and a sparse file of black pictures."""
-    from imfvla.data.frame_store import IMAGES, meta_of
+    from imfvla.data.checksums import with_checksums
+    from imfvla.data.frame_store import ARRAYS, IMAGES, meta_of
     from imfvla.training.data import store_path
 
     config, source, _ = prepare(episodes, folder)
@@ -94,7 +95,9 @@ def write_store(episodes: int, folder: Path) -> None:
         action[own] = walk[:, robot.origin] + 0.02 * rng.normal(size=(STEPS, len(robot.action)))
     entry = {"task": "socket", "instructions": SENTENCES, "num_steps": STEPS, "num_frames": STEPS}
     entries = [{"name": f"episode {index}", **entry} for index in range(episodes)]
-    meta = {**meta_of(source, views, SIZE), "episodes": entries}
+    state.flush()
+    action.flush()
+    meta = with_checksums({**meta_of(source, views, SIZE), "episodes": entries}, path, ARRAYS)
     (path / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
 
 

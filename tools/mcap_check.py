@@ -18,7 +18,7 @@ from mcap.records import Message, Statistics
 
 from imfvla.errors import UserError
 from imfvla.recording import Episode, read_episode
-from imfvla.recording.mcap_file import records
+from imfvla.recording.mcap_file import clear_read_errors, misplaced_end, records
 
 
 def check(path: Path) -> tuple[Episode, list[str]]:
@@ -28,14 +28,18 @@ def check(path: Path) -> tuple[Episode, list[str]]:
     counts: Counter[int] = Counter()
     statistics: Statistics | None = None
     last = 0
-    for record in records(path.read_bytes()):
-        if isinstance(record, Message):
-            counts[record.channel_id] += 1
-            if record.log_time < last:
-                problems.append(f"log time {record.log_time} follows {last}")
-            last = max(last, record.log_time)
-        elif isinstance(record, Statistics):
-            statistics = record
+    with clear_read_errors(path):
+        data = path.read_bytes()
+        if misplaced := misplaced_end(data):
+            problems.append(misplaced)
+        for record in records(data):
+            if isinstance(record, Message):
+                counts[record.channel_id] += 1
+                if record.log_time < last:
+                    problems.append(f"log time {record.log_time} follows {last}")
+                last = max(last, record.log_time)
+            elif isinstance(record, Statistics):
+                statistics = record
     if statistics is not None and not agree(statistics, counts):  # writers may leave them out
         problems.append("the counts of its statistics are not those of its messages")
     if lacking := set(episode.info.views) - set(episode.images):

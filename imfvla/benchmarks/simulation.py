@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from imfvla.benchmarks.clock import rate, times_ms
+from imfvla.benchmarks.forcing import forcing
 from imfvla.environment import Environment, bodies_of
 from imfvla.recording import Recordings
 from imfvla.sources.collection import collect
@@ -38,12 +39,16 @@ def measure_simulation(env: Environment) -> dict[str, float]:
 def measure_demonstrations(config: Mapping[str, Any], directory: Path) -> tuple[dict[str, float], Recordings]:
     """Records three demonstrations below `directory`, as `imfvla.collect` would, and times the last two.
 
-    Returns the rate of one process [1/min] and the recordings.
+    Returns the rate of one process [1/min] and the share of forcing files to disk, and the recordings.
     """
     demos = {**config["demos"], "directory": str(directory), "workers": 0, "episodes": 1}
     collect(config["task"], config["observation"], demos)
-    report = collect(config["task"], config["observation"], {**demos, "episodes": 3})
-    return {"demonstrations_per_min": 60 * report.num_new / report.wall_s}, report.recordings
+    with forcing() as forced:
+        report = collect(config["task"], config["observation"], {**demos, "episodes": 3})
+    return {
+        "demonstrations_per_min": 60 * report.num_new / report.wall_s,
+        "forcing_percent": 100 * forced.seconds / report.wall_s,
+    }, report.recordings
 
 
 def _rest(env: Environment) -> np.ndarray:

@@ -39,6 +39,7 @@ def simulation_rows(figures: Mapping[str, float]) -> tuple[tuple[str, str, str],
         ("control_steps_per_s", "control steps", 0, "1/s, one process, not rendered"),
         ("ms_per_view", "rendered view", 2, "ms"),
         ("demonstrations_per_min", "demonstrations", 1, "1/min, one process, recorded"),
+        ("forcing_percent", "  forced to disk", 3, "% of their time"),
     )
     return tuple(
         (what, number(figures[key], digits), unit) for key, what, digits, unit in rates if key in figures
@@ -68,6 +69,12 @@ def training_rows(figures: Mapping[str, Any]) -> tuple[tuple[str, str, str], ...
             number(figures["peak_gflops"], 1),
             f"GFLOP/s, {figures['precision']} matrix product, {figures['threads']} thread(s); "
             f"achieved {figures['share_of_peak']:.0%}",
+        ),
+        ("saving state and weights", number(figures["saving_ms"], 1), "ms"),
+        (
+            "  forced to disk",
+            number(figures["forcing_ms"], 1),
+            f"ms, {figures['forcing_share']:.4%} of training",
         ),
     )
 

@@ -12,6 +12,7 @@ import torch
 
 from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
+from imfvla.benchmarks.forcing import measure_saving
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.policy import Policy
 from imfvla.sources.base import EpisodeSource
@@ -56,6 +57,7 @@ def measure_training(
             if index == 2:  # the first steps warm up
                 spent.clear()
             _step(trainer, batches, spent)
+        saving = measure_saving(trainer)
     finally:
         batches.close()
         trainer.batches.close()
@@ -73,6 +75,7 @@ def measure_training(
         "achieved_gflops": flops / step_ms / 1e6,
         "peak_gflops": peak / 1e9,
         "share_of_peak": 1e3 * flops / step_ms / peak,
+        **saving,
     }
 
 

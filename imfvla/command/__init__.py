@@ -11,6 +11,7 @@ from typing import ParamSpec, TextIO
 
 from imfvla.errors import UserError, as_user_error
 from imfvla.process.signals import Stopped, StopRequest, stop_at_once, stoppable
+from imfvla.process.visible import VisibleStream, visible
 
 EXIT_FAILURE, EXIT_USER_ERROR = 1, 2
 P = ParamSpec("P")
@@ -20,7 +21,8 @@ def begin() -> None:
     """The first call of a command's file, before its other imports, which take seconds.
 
     A signal ends the process without a traceback. Standard output and standard error escape what their encoding
-    lacks, are always open, and drop what is written once nobody reads it any more.
+    lacks and characters that would act on a terminal, are always open, and drop what is written once nobody reads it
+    any more.
     """
     stop_at_once()
     logging.raiseExceptions = False  # a line of a log that cannot be written is dropped too
@@ -53,7 +55,7 @@ def as_command(function: Callable[P, int | None]) -> Callable[P, int]:
             if request.number is None and known is None:
                 raise
             if request.number is None:
-                print(known, file=sys.stderr)
+                print(visible(str(known)), file=sys.stderr)
                 return EXIT_USER_ERROR
         if request.number is None:
             return code
@@ -92,7 +94,7 @@ def _stream(usual: TextIO | None, descriptor: int) -> TextIO:
     """`usual`, or a replacement where it was closed, with the behaviour that `begin` promises."""
     output = _Output(descriptor, "w", closefd=False)
     is_unbuffered = usual is not None and usual.write_through  # PYTHONUNBUFFERED
-    return io.TextIOWrapper(
+    return VisibleStream(
         output if is_unbuffered else io.BufferedWriter(output),
         encoding=usual.encoding if usual else "utf-8",
         errors="backslashreplace",

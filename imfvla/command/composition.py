@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import (
@@ -32,20 +34,50 @@ from imfvla.storage.run_names import key_of, run_name
 CONFIG_DIRECTORY = folder("conf")
 VERSION_BASE = "1.3"
 SEARCH_PATH = "hydra.searchpath"
+COMMAND_LINE = "command-line"  # what Hydra calls the provider of --config-dir
 
 
-def compose(config_name: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where configs are besides `conf`: the folder of --config-dir, and the override of hydra.searchpath, if any."""
+
+    more: Path | None = None
+    search_path: tuple[str, ...] = ()
+
+    @classmethod
+    def of_command(cls) -> "Places":
+        """Those of the command that runs, for the configs that it composes itself."""
+        if not HydraConfig.initialized():
+            return cls()
+        hydra = HydraConfig.get()
+        given = [source.path for source in hydra.runtime.config_sources if source.provider == COMMAND_LINE]
+        more = Path(given[0]).absolute() if given else None
+        return cls(more, tuple(searched(hydra.overrides.hydra)))
+
+
+NOWHERE_ELSE = Places()
+
+
+def compose(config_name: str, overrides: Sequence[str] = (), places: Places = NOWHERE_ELSE) -> dict[str, Any]:
     """The config `conf/<config_name>.yaml` under command-line style overrides, resolved, as plain dicts.
 
     Raises UserError where an override, a group's choice or a key is not known.
     """
     register_resolvers()
+    overrides = [*places.search_path, *overrides]
     try:
-        refuse_added_keys(config_name, overrides)
-        with configs(config_name):
-            return to_plain(hydra_compose(config_name, list(overrides)))
+        refuse_added_keys(config_name, overrides, places.more)
+        with configs(config_name, places.more):
+            return to_plain(hydra_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise explain(error, config_name, overrides) from error
+        raise explain(error, config_name, overrides, places.more) from error
+
+
+def choices_of(group: str, config_name: str, places: Places = NOWHERE_ELSE) -> list[str]:
+    """What the group has in `conf` and in these places, by name."""
+    with configs(config_name, places.more) as hydra:
+        options = hydra.config_loader.get_group_options(group, None, config_name, list(places.search_path))
+        return sorted(options)
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
@@ -62,7 +94,7 @@ def configs(config_name: str, more: Path | None = None) -> Iterator[Hydra]:
         hydra = GlobalHydra.instance().hydra
         if more is not None:
             search_path = hydra.config_loader.get_search_path()
-            search_path.prepend("command-line", f"file://{more}", SearchPathQuery(provider="schema"))
+            search_path.prepend(COMMAND_LINE, f"file://{more}", SearchPathQuery(provider="schema"))
             hydra.config_loader = ConfigLoaderImpl(search_path)  # which lists its sources when it is made
         yield hydra
 

@@ -20,6 +20,7 @@ from imfvla.command.jobs import Failure, HydraJob
 from imfvla.command.line import in_hydras_words, multiplies, refuse_ignored
 from imfvla.command.sweep import IsFinished, names_a_sweep, run_sweep
 from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
+from imfvla.process.visible import visible
 
 
 def entry_point(
@@ -121,7 +122,9 @@ def _report(failures: Sequence[Failure]) -> int:
     """Prints the failures and returns the exit code."""
     for failure in failures:
         prefix = f"[{failure.overrides}] " if len(failures) > 1 else ""
-        print(f"{prefix}{failure.text}", file=sys.stderr)
+        # A sentence for a user is one line; a traceback has several.
+        text = visible(failure.text) if failure.is_user_error else failure.text
+        print(f"{visible(prefix)}{text}", file=sys.stderr)
     if all(failure.is_user_error for failure in failures):
         return EXIT_USER_ERROR if failures else 0
     return EXIT_FAILURE

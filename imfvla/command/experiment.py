@@ -3,8 +3,8 @@
 import logging
 import os
 import traceback
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,8 @@ from imfvla.rollouts.offline import evaluate_offline
 from imfvla.sources.collection import check_demonstrations
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.sources.same_robot import refuse_other_robot
-from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, config_digest
+from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, plain
+from imfvla.training.checkpoint import check_weights
 from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
 from imfvla.training.experiment import ExperimentOptions
 from imfvla.training.loop import Trainer
@@ -38,11 +39,12 @@ INITIALISATION_STREAM = 2  # of the random numbers that initialise a policy
 log = logging.getLogger(__name__)
 
 
-def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
+def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequence[str] = ()) -> None:
     """Does the remaining work of the experiment in `run` and prints its row, or how it does offline.
 
-    `config` is train.yaml composed, as plain dicts. status.json says running, then done, or failed with the
-    traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be collected.
+    `config` is train.yaml composed under `overrides`, as plain dicts. status.json says running, then done, or failed
+    with the traceback. Raises UserError on a bad config, a directory that holds another run, data that cannot be
+    collected.
     """
     options = checked_options(config)
     is_trained = options.training.steps in run.weight_steps()
@@ -52,14 +54,14 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory) -> None:
         _check_source(config)
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
-    run.refuse_links_outside()
+    run.refuse_strangers()
     if has_environment(config) and run.status().get("state") != DONE:
         _check_environment(config)  # else training would end before an evaluation that fails
     with joined_processes(options.training.device) as processes:
         if not is_trained:
             processes.check(options.training)
         if processes.is_first:
-            _run_stages(config, options, run, processes)
+            _run_stages(config, options, run, overrides, processes)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, options, run, processes)
 
@@ -81,16 +83,15 @@ def _check_environment(config: Mapping[str, Any]) -> None:
     if kind_of(config["task"]) == BIMANUAL:
         select_gl_backend()
         return
-    env = environment_of(config)
-    refuse_other_robot(
-        robot_of(config),
-        env.robot,
-        view_options(config).views,
-        of="task.robot",
-        where=f"The environment {env.name}",
-        remedy="Correct task.robot.",
-    )
-    env.close()
+    with closing(environment_of(config)) as env:
+        refuse_other_robot(
+            robot_of(config),
+            env.robot,
+            view_options(config).views,
+            of="task.robot",
+            where=f"The environment {env.name}",
+            remedy="Correct task.robot.",
+        )
 
 
 def _check_source(config: Mapping[str, Any]) -> None:
@@ -107,17 +108,23 @@ def _check_source(config: Mapping[str, Any]) -> None:
 
 
 def _run_stages(
-    config: Mapping[str, Any], options: ExperimentOptions, run: RunDirectory, processes: Alone
+    config: Mapping[str, Any],
+    options: ExperimentOptions,
+    run: RunDirectory,
+    overrides: Sequence[str],
+    processes: Alone,
 ) -> None:
     """All stages, except the other processes' shares of training."""
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         _refuse_other_robot(config, run)
+        run.keep_overrides(overrides)
         try:
             is_trained = options.training.steps in run.weight_steps()
             processes.first_of(STAGES, EVALUATE if is_trained else TRAIN)
             if is_trained:
                 log.info(f"{run.path} is trained already: all {options.training.steps} steps are done.")
+                check_weights(run, options.evaluation.checkpoint)
             else:
                 _train(config, options, run, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
@@ -170,7 +177,8 @@ def _train(
             "seed": options.seed,
             "num_parameters": num_parameters,
             "robot": robot_of(config).to_json(),
-            "config_digest": config_digest(config, EXECUTION_KEYS),
+            "config": plain(config),
+            "data": dict(windows.store.content),
         },
         processes=processes,
     )

@@ -28,7 +28,7 @@ from imfvla.reporting.results import Result
 from imfvla.reporting.runs import find_runs, key_of
 from imfvla.reporting.table import Table
 from imfvla.reporting.tables import Document, comparison_table, other_table, row_table
-from imfvla.storage.files import copy_file, write_together
+from imfvla.storage.files import write_together
 
 MAX_HEAT_MAPS = 4
 OF_TABLE = {  # by `figure` of a table: what draws its rows, and what that shows
@@ -44,13 +44,13 @@ class Publication:
 
     tables: tuple[Table, ...]
     files: dict[Path, bytes]
-    copies: dict[Path, Path]  # of files of runs that the page shows: copy -> original
+    copies: dict[
+        Path, tuple[Path, Path]
+    ]  # of files of runs that the page shows: copy -> original, run directory
 
     def write(self) -> list[Path]:
         """All files or none, after the copies. Raises UserError on a write error."""
-        for copy, original in self.copies.items():
-            copy_file(original, copy)
-        write_together(self.files)
+        write_together(self.files, self.copies)
         return list(self.files)
 
 

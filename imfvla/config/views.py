@@ -1,13 +1,14 @@
 """What an observation shows: which cameras, and how large their pictures may be."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from imfvla.options import build, part_of, require
 
-SMALLEST = (8, 8)  # (H, W) [px]
-LARGEST = (960, 1280)  # (H, W) [px]; the scene of our own tasks has a buffer of this size to draw into
+SIZE = "observation.image_size"
+SMALLEST = 8  # pixels of a side
+MAX_PIXELS = 4096 * 4096  # of one picture: a small file can state a size that fills the memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +22,16 @@ class ViewOptions:
         key, names = "observation.views", list(self.views)
         require(bool(names), key, "one or more views", names)
         require(len(set(names)) == len(names), key, "views that all differ", names)
-        fits = all(
-            low <= size <= high for low, size, high in zip(SMALLEST, self.image_size, LARGEST, strict=True)
-        )
-        limits = f"height {SMALLEST[0]} to {LARGEST[0]} and width {SMALLEST[1]} to {LARGEST[1]}"
-        require(
-            fits, "observation.image_size", f"[height, width] with {limits} pixels", list(self.image_size)
-        )
+        height, width = self.image_size
+        wanted = f"[height, width] of at least {SMALLEST} pixels each and at most {MAX_PIXELS} in all"
+        fits = min(height, width) >= SMALLEST and height * width <= MAX_PIXELS
+        require(fits, SIZE, wanted, list(self.image_size))
+
+
+def require_drawable(size: Sequence[int], largest: tuple[int, int]) -> None:
+    """Raises UserError where pictures (H, W) [px] are larger than the buffer that they would be drawn into."""
+    fits = size[0] <= largest[0] and size[1] <= largest[1]
+    require(fits, SIZE, f"at most {list(largest)}, the buffer that pictures are drawn into", list(size))
 
 
 def view_options(config: Mapping[str, Any]) -> ViewOptions:

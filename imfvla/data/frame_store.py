@@ -9,27 +9,53 @@ import math
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
+from imfvla.data.checksums import checked_sums, digest_of, remember, with_checksums
 from imfvla.data.resample import resample
 from imfvla.errors import UserError
+from imfvla.options import at_most, of_length, within, within_length
+from imfvla.robot import MAX_CAMERAS, MAX_SIDE
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
 from imfvla.sources.validation import check_episode
 from imfvla.storage.documents import read_json
-from imfvla.storage.files import locked, write_remedy
+from imfvla.storage.files import clear_folder, locked, make_folder, put_folder, write_remedy
+from imfvla.storage.opening import ARRAY, checked
+from imfvla.storage.records import read_record
 
 FORMAT = 2
 IMAGES = "images.raw"
-FILES = {IMAGES, "image_steps.npy", "state.npy", "action.npy", "meta.json"}
+ARRAYS = (IMAGES, "image_steps.npy", "state.npy", "action.npy")
+FILES = {*ARRAYS, "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
 
 Progress = Callable[[int, int], None]  # called with (episodes done, episodes in all)
+
+
+class EpisodeEntry(TypedDict):
+    """An episode in `meta.json`."""
+
+    name: str
+    task: str
+    instructions: Annotated[list[Annotated[str, at_most(10_000)]], within_length(1, 10_000)]
+    num_steps: Annotated[int, within(1, 10**7)]
+    num_frames: Annotated[int, within(0, 10**7)]
+
+
+class StoreMeta(TypedDict):
+    """`meta.json`."""
+
+    format: int
+    digest: str
+    views: Annotated[list[str], within_length(1, MAX_CAMERAS)]
+    image_size: Annotated[list[Annotated[int, within(1, MAX_SIDE)]], of_length(2)]
+    episodes: list[EpisodeEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +83,28 @@ class FrameStore:
     image_steps: np.ndarray  # int64 (N,)  step of each frame within its episode, memory-mapped
     state: np.ndarray  # float32 (T, S), memory-mapped
     action: np.ndarray  # float32 (T, A)  clean, memory-mapped
+    content: Mapping[
+        str, str
+    ]  # what is trained on: a digest of each array, of the episodes and of their source
 
     @classmethod
     def open(cls, path: str | Path) -> "FrameStore":
-        """The store that `build` wrote to `path`. Raises UserError where there is none or it is damaged."""
+        """The store that `build` wrote to `path`, whose arrays are compared with their checksums once a process.
+
+        Raises UserError where there is none or it is damaged, naming file and block.
+        """
         path = Path(path)
         try:
-            meta = read_json(path / "meta.json", "delete the store", mapping=True)
+            meta = read_record(path / "meta.json", StoreMeta, "delete the store")
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
+            sums = checked_sums(path, meta, ARRAYS)
+            content = {name: digest_of(sums[name]) for name in ARRAYS}
+            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
-            images = np.asarray(np.memmap(path / IMAGES, np.uint8, "r", shape=shape))
+            images = _mapped(path / IMAGES, np.uint8, shape)
             episodes, row, frame = [], 0, 0
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
@@ -80,13 +115,14 @@ class FrameStore:
                 row, frame = row + entry["num_steps"], frame + len(steps)
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
+            _check_arrays(state, action, image_steps, episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it, or choose another folder with "
                 "demos.frames_directory, and run again."
             ) from error
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
-        return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action)
+        return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action, content)
 
     @classmethod
     def build(
@@ -111,9 +147,26 @@ class FrameStore:
             source.robot.camera(view)
         meta = meta_of(source, tuple(views), tuple(image_size))
         with locked(store_path):
+            clear_folder(store_path)
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
+
+
+def _check_arrays(
+    state: np.ndarray, action: np.ndarray, image_steps: np.ndarray, episodes: Sequence[StoredEpisode]
+) -> None:
+    """Raises ValueError where arrays are not of the types that `build` writes, or have frames of no step."""
+    for name, array, kind, dimensions in (
+        ("state", state, np.float32, 2),
+        ("action", action, np.float32, 2),
+        ("image_steps", image_steps, np.int64, 1),
+    ):
+        if array.dtype != kind or array.ndim != dimensions:
+            raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
+    lengths = np.repeat([e.num_steps for e in episodes], [len(e.image_steps) for e in episodes])
+    if (image_steps < 0).any() or (image_steps >= lengths).any():
+        raise ValueError("image_steps are not all of its episodes' steps")
 
 
 def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
@@ -127,6 +180,12 @@ def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int
     }
 
 
+def _digest_of_episodes(meta: Mapping[str, Any]) -> str:
+    """Of what a training takes from meta.json: not the names, which only messages need."""
+    entries = [{key: entry[key] for key in entry if key != "name"} for entry in meta["episodes"]]
+    return digest_of([meta["views"], meta["image_size"], entries])
+
+
 def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
     try:
         return read_json(store_path / "meta.json", "", mapping=True).get("digest") == meta["digest"]
@@ -136,7 +195,7 @@ def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
 
 def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progress: Progress) -> None:
     """Writes a complete store beside `store_path` and moves it there."""
-    if store_path.exists() and not (store_path.is_dir() and set(os.listdir(store_path)) <= FILES):
+    if store_path.exists() and not (store_path.is_dir() and _names(store_path) <= FILES):
         raise UserError(
             f"{store_path} is the place of decoded frames, but is not a frame store: move it away, or choose another "
             "folder with demos.frames_directory."
@@ -144,7 +203,7 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
     part = store_path.with_name(f".{store_path.name}.part")
     needed = _num_frames(source, meta["views"]) * len(meta["views"]) * 3 * math.prod(meta["image_size"])
     try:
-        store_path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(store_path.parent)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         if (free := shutil.disk_usage(part).free) < needed:
@@ -153,9 +212,9 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
                 "space, choose another disk with demos.frames_directory, or lower observation.image_size or the "
                 "number of views."
             )
-        _write_arrays(source, part, meta, progress)
-        shutil.rmtree(store_path, ignore_errors=True)
-        part.rename(store_path)
+        written = _write_arrays(source, part, meta, progress)
+        put_folder(part, store_path)
+        remember(store_path, written, ARRAYS)
     except OSError as error:
         raise UserError(
             f"Cannot write frame store {store_path}: {error.strerror or error}; choose another folder with "
@@ -163,6 +222,11 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
         ) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _names(store_path: Path) -> set[str]:
+    """The files of a store, without those that NFS keeps while a process has them open."""
+    return {name for name in os.listdir(store_path) if not name.startswith(".nfs")}
 
 
 def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
@@ -176,7 +240,10 @@ def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
     return found
 
 
-def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress) -> None:
+def _write_arrays(
+    source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress
+) -> dict[str, Any]:
+    """Fills the folder `part`; returns the content of its meta.json."""
     entries, steps, states, actions = [], [], [], []
     with open(part / IMAGES, "wb") as stream:
         for episode, frames in _decoded(source, meta["views"], meta["image_size"]):
@@ -196,7 +263,9 @@ def _write_arrays(source: EpisodeSource, part: Path, meta: dict[str, Any], progr
     _save(part / "image_steps.npy", np.concatenate(steps))
     _save(part / "state.npy", np.concatenate(states))
     _save(part / "action.npy", np.concatenate(actions))
-    (part / "meta.json").write_text(json.dumps(meta | {"episodes": entries}, indent=1), encoding="utf-8")
+    meta = with_checksums(meta | {"episodes": entries}, part, ARRAYS)
+    (part / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    return meta
 
 
 def _save(path: Path, array: np.ndarray) -> None:
@@ -204,8 +273,19 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _load(path: Path) -> np.ndarray:
-    """Memory-mapped: all processes share it, and a header that states more than the file holds is refused."""
-    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    """Memory-mapped: all processes share it. Raises ValueError where its file has another size than it states."""
+    array = np.load(checked(path, ARRAY), mmap_mode="r", allow_pickle=False)
+    if not isinstance(array, np.memmap) or path.stat().st_size != array.offset + array.nbytes:
+        raise ValueError(f"{path.name} has {path.stat().st_size} bytes, wanted another number")
+    return np.asarray(array)
+
+
+def _mapped(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
+    """The same for a file without a header."""
+    size, wanted = path.stat().st_size, math.prod(shape) * np.dtype(kind).itemsize
+    if size != wanted:
+        raise ValueError(f"{path.name} has {size} bytes, wanted {wanted}")
+    return np.asarray(np.memmap(checked(path, ARRAY), kind, "r", shape=shape))
 
 
 def _decoded(

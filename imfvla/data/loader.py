@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from imfvla.data.augment import Augmentation
+from imfvla.data.same_content import refuse_other_content
 from imfvla.data.sampler import ResumableSampler
 from imfvla.data.windows import Windows
 from imfvla.types import Batch
 
+DATA = "data"  # key of a state
 RANDOM_STREAM = 1  # differs from the sampler's SeedSequence([seed, epoch]) in length
 
 
@@ -66,13 +68,17 @@ class Loader(Iterator[Batch]):
         """Episode file and step of each row of batch `number`."""
         return self._windows.describe(self._sampler.batch(number))
 
-    def state_dict(self) -> dict[str, int]:
-        """The sampler's state: the next batch to hand out."""
-        return self._sampler.state_dict()
+    def state_dict(self) -> dict[str, Any]:
+        """The sampler's state, which is the next batch to hand out, and digests of the data."""
+        return {**self._sampler.state_dict(), DATA: dict(self._windows.store.content)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resumes where `state` was taken; batches prepared ahead are dropped."""
+        """Resumes where `state` was taken; batches prepared ahead are dropped.
+
+        Raises UserError where number of items, batch size, seed or data differ.
+        """
         self._sampler.load_state_dict(state)
+        refuse_other_content(state.get(DATA), self._windows.store, "the saved state")
         self._drop()
 
     def close(self) -> None:

@@ -2,10 +2,22 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
+from typing import Annotated, TypedDict
 
 import numpy as np
 
 from imfvla.errors import UserError
+from imfvla.options import at_least
+from imfvla.storage.records import Seed, Step, as_record
+
+
+class SamplerState(TypedDict):
+    """Where in the batches of which data a training is."""
+
+    next_batch: Step
+    num_items: Annotated[int, at_least(1)]
+    batch_size: Annotated[int, at_least(1)]
+    seed: Seed
 
 
 class ResumableSampler:
@@ -45,14 +57,16 @@ class ResumableSampler:
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Resumes where `state` was taken. Raises UserError where data, batch size or seed differ."""
+        """Resumes where `state` was taken. Raises UserError where data, batch size or seed differ, or are not said."""
+        remedy = "restore the state, or move it away and train again"
+        state = as_record(state, SamplerState, "The batches of the state to resume from", remedy)
         for name in ("num_items", "batch_size", "seed"):
             if state[name] != getattr(self, name):
                 raise UserError(
                     f"Cannot resume: the checkpoint was made with {name} {state[name]}, found "
                     f"{getattr(self, name)}. Restore the run's data and configuration, or start a new run."
                 )
-        self.next_batch = int(state["next_batch"])
+        self.next_batch = state["next_batch"]
 
 
 @lru_cache(maxsize=2)  # a batch at the border of two epochs needs both

@@ -2,22 +2,37 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
-from imfvla.errors import UserError
 from imfvla.figures.description import TWO_SUBLAYERS, sublayers_of
 from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
-from imfvla.storage.documents import MAX_JSON_BYTES, parse_json, read_text
+from imfvla.options import at_most, require, within
+from imfvla.storage.records import Name, Step, read_record
 
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
 COLUMNS = 2
 TICKS = (0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1)
+MOST_SUBLAYERS = 200  # a line of text for each
 BRIGHT = 0.3  # from this weight on, the colour needs dark text
 SHORT = {"attention": "attn", "cross-attention": "cross"}
+
+
+Weights = Annotated[
+    list[Annotated[list[Annotated[float, within(0, 1)]], at_most(MOST_SUBLAYERS)]], at_most(MOST_SUBLAYERS)
+]
+
+
+class DepthWeights(TypedDict):
+    """What is recorded of a policy: for each sublayer that reads, the weights of those before it."""
+
+    experiment: Name
+    checkpoint_step: Step
+    actions: Weights
+    context: Weights
 
 
 def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
@@ -29,12 +44,8 @@ def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> di
     if not path.exists():
         return None
     remedy = f"delete it or repeat python tools/depth_attention.py {run}"
-    try:
-        found = parse_json(read_text(path, MAX_JSON_BYTES))
-        _matrix(found["actions"])
-        found["experiment"], found["checkpoint_step"]
-    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise UserError(f"{path} holds no depth weights: {error!r}; {remedy}.") from error
+    found = read_record(path, DepthWeights, remedy)
+    require(any(found["actions"]), f"{path}: actions", "weights of at least one sublayer", "none")
     return found | {"sublayers": sublayers_of(core) if core else TWO_SUBLAYERS}
 
 

@@ -162,7 +162,7 @@ def _is_joint(channel: str) -> bool:
 
 
 def _class(part: Mapping[str, Any]) -> str:
-    return part["_target_"].rpartition(".")[2]
+    return str(part.get("_target_", "")).rpartition(".")[2]
 
 
 def _name(part: Mapping[str, Any], names: Mapping[str, str]) -> str:

@@ -60,12 +60,13 @@ class Sheet:
     def text(
         self, x: float, y: float, text: str, width: float | None = None, *, size: float = 8.0, **options
     ) -> None:
-        """Text around (x, y), made smaller until it is no wider than `width` units.
+        """Text around (x, y), with formulas between dollar signs, made smaller until it is no wider than `width` units.
 
         Raises ValueError where it would become unreadable.
         """
         size *= SCALE
-        options = {"ha": "center", "va": "center", "color": INK, "linespacing": 1.35} | options
+        usual = {"ha": "center", "va": "center", "color": INK, "linespacing": 1.35, "parse_math": True}
+        options = usual | options
         drawn = self.axes.text(x, y, text, fontsize=size, **options)
         if width is None:
             return

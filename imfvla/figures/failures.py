@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from imfvla.figures.names import result_name
 from imfvla.figures.panels import say_nothing_yet, stages_of, tasks_of
 from imfvla.figures.style import INK, VERMILION, WIDTH, new_figure, style
+from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
-from imfvla.reporting.rows import Row
 
 SHADES = LinearSegmentedColormap.from_list("failures", [VERMILION, "#fbe3d0"])
 BAR, FRAME = 0.19, 1.25  # inches: of a bar with its gap, of what is above and below the bars of a panel

@@ -19,6 +19,7 @@ from imfvla.reporting.runs import Evaluation
 
 COLUMNS, PANEL, LEGEND_LINE = 3, 1.9, 0.165  # panels in a row, inches, inches
 TITLE, NAME = 36, 38  # characters a line
+LEAST, MOST = 1e-30, 1e30  # of a loss that is drawn: on a wider axis no curve would be seen
 WIDE = 8  # ratio of an axis's ends from which fewer ticks have numbers
 OUTPUTS = {"data": "clean action as output", "velocity": "velocity as output"}  # by parametrisation
 # what gives the loss of a generator other units: curves that differ in it are not compared
@@ -82,6 +83,8 @@ def _curves(results: Sequence[Result]) -> dict[str, Curves]:
     kinds: dict[str, list[tuple[Evaluation, tuple[np.ndarray, np.ndarray]]]] = {}
     for evaluation in runs.values():
         steps, loss = learning_curve(evaluation.run)
+        drawn = (np.abs(loss) >= LEAST) & (np.abs(loss) <= MOST)
+        steps, loss = steps[drawn], loss[drawn]
         if steps.size:
             kinds.setdefault(json.dumps(_kind(evaluation)), []).append((evaluation, (steps, loss)))
     titles = _titles([json.loads(kind) for kind in kinds])
@@ -112,7 +115,7 @@ def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _class(part: Mapping[str, Any]) -> str:
-    return part.get("_target_", "").rpartition(".")[2]
+    return str(part.get("_target_", "")).rpartition(".")[2]
 
 
 def _name(evaluation: Evaluation) -> str:

@@ -14,9 +14,9 @@ LINES = ("-", "--", ":", "-.")
 
 
 def tasks_of(results: Sequence[Result]) -> dict[str, str]:
-    """Title by task, a panel for each: the tasks whose tables have a figure, then the others of the results."""
+    """Title by task, a panel for each: the tasks of printed tables, then the others of the results."""
     mapping = read_mapping()
-    drawn = {table.task for table in mapping.of_rows if table.figure is not None}
+    drawn = {table.task for table in mapping.of_rows if table.printed is not None}
     names = [task.name for task in mapping.tasks if task.name in drawn]
     others = sorted({result.task for result in results if result.task is not None} - set(names))
     return {name: mapping.task(name).title for name in (*names, *others)}

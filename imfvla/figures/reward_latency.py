@@ -87,6 +87,7 @@ def _panel(axes: Axes, title: str, points: Sequence[Point], methods: Sequence[st
     axes.set_title(title)
     axes.set_xlabel("time of one action chunk [ms], log axis")
     axes.set_xscale("log")
+    plain_log_ticks(axes.xaxis)
     if not points:
         axes.text(0.5, 0.5, "no row measured yet", transform=axes.transAxes, ha="center", color=GREY)
         return
@@ -104,7 +105,6 @@ def _panel(axes: Axes, title: str, points: Sequence[Point], methods: Sequence[st
               label="Pareto frontier")  # fmt: skip
     low, high = axes.get_xlim()
     axes.set_xlim(low / 1.3, high * 1.9)  # room for labels
-    plain_log_ticks(axes.xaxis)
 
 
 def errors(measured: Sequence[Measured]) -> np.ndarray:

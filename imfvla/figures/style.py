@@ -7,6 +7,9 @@ from contextlib import contextmanager
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from imfvla.process.visible import visible
 
 # Okabe and Ito's colours, told apart with every common kind of colour blindness.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
@@ -28,6 +31,7 @@ STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "figure.facecolor": "white",
+    "text.parse_math": False,  # names come from files, and a "$" in one is a "$"; diagrams allow it for themselves
     "svg.fonttype": "path",
     "svg.hashsalt": "imfvla",  # element names, random otherwise
 }
@@ -54,6 +58,8 @@ def new_figure(width: float, height: float) -> Figure:
 def render(figure: Figure) -> dict[str, bytes]:
     """Content by suffix: ".svg" and ".png", without dates and versions."""
     content = {}
+    for text in figure.findobj(Text):
+        text.set_text(visible(text.get_text(), keep="\n"))  # XML takes no control characters
     with style():
         figure.draw_without_rendering()
     figure.set_layout_engine("none")  # the layout is computed: it need not be repeated for each format

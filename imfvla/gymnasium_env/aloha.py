@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 from dm_control.mujoco import engine
 
-from imfvla.config.views import LARGEST
+from imfvla.config.views import require_drawable
+
+LARGEST_PICTURE = (960, 1280)  # (H, W) [px]
 
 
 class AlohaCameras:
@@ -24,12 +26,13 @@ class AlohaCameras:
         model = physics.model
         model.vis.quality.shadowsize = 0
         model.vis.quality.offsamples = 0
-        model.vis.global_.offheight, model.vis.global_.offwidth = (2 * size for size in LARGEST)
+        model.vis.global_.offheight, model.vis.global_.offwidth = (2 * size for size in LARGEST_PICTURE)
         self.names = tuple(model.id2name(number, "camera") for number in range(model.ncam))
         self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
 
     def draw(self, name: str, height: int, width: int) -> np.ndarray:
         """uint8 (height, width, 3), each pixel the mean of 2 x 2: half the time of MuJoCo's own multisampling."""
+        require_drawable((height, width), LARGEST_PICTURE)
         key = (name, height, width)
         if key not in self._cameras:
             self._cameras[key] = engine.Camera(self._physics, 2 * height, 2 * width, name)

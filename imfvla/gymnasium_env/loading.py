@@ -1,6 +1,7 @@
 """Builds a Gymnasium environment from its YAML, and checks the one against the other before anything is recorded."""
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -44,9 +45,12 @@ def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEn
             f"task.kwargs={wanted.kwargs} do not fit {wanted.id} ({error}): correct them."
         ) from error
     loaded = GymnasiumEnvironment(env, wanted, cameras_of(wanted.package, env))
-    _check_actions(env.action_space, wanted)
-    _check_rate(env.metadata, wanted)
-    _try(loaded)
+    with ExitStack() as refused:
+        refused.callback(loaded.close)
+        _check_actions(env.action_space, wanted)
+        _check_rate(env.metadata, wanted)
+        _try(loaded)
+        refused.pop_all()  # it is not
     return loaded
 
 

@@ -13,6 +13,7 @@ from imfvla.recording import Episode, read_episode
 from imfvla.sources.collection import (
     LATER_SETTINGS,
     LOG_NAME,
+    CollectionLog,
     read_settings,
     record_demonstration,
     recorded_seeds,
@@ -20,8 +21,8 @@ from imfvla.sources.collection import (
     sizes_of,
 )
 from imfvla.sources.demonstrations import BimanualSettings
-from imfvla.storage.documents import read_json
 from imfvla.storage.files import locked
+from imfvla.storage.records import read_record
 
 MOST_FAILURES = 20  # of the expert, before it is given up
 # What a recording must share with the run. Its noise, and the time held after success, may differ.
@@ -133,7 +134,4 @@ def _failed_seeds(directory: Path) -> set[int]:
     path = directory / LOG_NAME
     if not path.exists():
         return set()
-    failed = read_json(path, "restore it, or take it away", mapping=True).get("failed_seeds")
-    if not isinstance(failed, list) or not all(isinstance(seed, int) for seed in failed):
-        raise UserError(f"{path} must list failed_seeds, found {failed!r}: restore it, or take it away.")
-    return set(failed)
+    return set(read_record(path, CollectionLog, "restore it, or take it away")["failed_seeds"])

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
+from imfvla.nn.sizes import LAYERS, WIDTH
 from imfvla.options import above, at_least, within
 
 
@@ -29,12 +30,12 @@ class ActCore(nn.Module):
         *,
         steps: Annotated[int, at_least(1)],
         channels: Annotated[int, at_least(1)],
-        width: Annotated[int, at_least(1)],
-        heads: Annotated[int, at_least(1)],
-        depth: Annotated[int, at_least(1)],
-        decoder_depth: Annotated[int, at_least(1)],
-        style_depth: Annotated[int, at_least(1)],
-        style_width: Annotated[int, at_least(1)],
+        width: Annotated[int, WIDTH],
+        heads: Annotated[int, WIDTH],
+        depth: Annotated[int, LAYERS],
+        decoder_depth: Annotated[int, LAYERS],
+        style_depth: Annotated[int, LAYERS],
+        style_width: Annotated[int, WIDTH],
         state_token: int,
         mlp_ratio: Annotated[float, above(0)],
         dropout: Annotated[float, within(0, 1)],

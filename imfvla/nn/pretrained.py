@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
+from imfvla.storage.opening import ANYWHERE, WEIGHTS, checked
 
 SHOWN = 4  # names of one kind in a message
 
@@ -43,7 +44,9 @@ def read_weights(path: str | Path, key: str) -> dict[str, Tensor]:
             f"{path.stem + '.safetensors'!r}); pickles are not read here."
         )
     try:
-        return load_file(path)
+        return load_file(checked(path, WEIGHTS, home=ANYWHERE))
+    except UserError as error:
+        raise UserError(f"{key}: {error}") from error
     except FileNotFoundError:
         raise UserError(
             f"{key} names {path}, which is not there: correct the path, or take null to begin with random weights."

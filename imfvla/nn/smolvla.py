@@ -17,6 +17,7 @@ from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.pretrained import Backbone
+from imfvla.nn.sizes import LAYERS, WIDTH
 from imfvla.nn.transformer import Conditioning, SwiGLU
 from imfvla.options import above, at_least
 
@@ -130,10 +131,10 @@ class SmolVLACore(Backbone, nn.Module):
         *,
         steps: Annotated[int, at_least(1)],
         channels: Annotated[int, at_least(1)],
-        width: Annotated[int, at_least(1)],
-        expert_width: Annotated[int, at_least(1)],
-        depth: Annotated[int, at_least(1)],
-        heads: Annotated[int, at_least(1)],
+        width: Annotated[int, WIDTH],
+        expert_width: Annotated[int, WIDTH],
+        depth: Annotated[int, LAYERS],
+        heads: Annotated[int, WIDTH],
         mlp_ratio: Annotated[float, above(0)],
         max_rad: Annotated[float, above(0)],
         pretrained: str | None,

@@ -26,6 +26,7 @@ from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.residual import History
+from imfvla.nn.sizes import LAYERS, WIDTH
 from imfvla.options import above, at_least
 
 
@@ -110,9 +111,9 @@ class TransformerCore(nn.Module):
         *,
         steps: Annotated[int, at_least(1)],
         channels: Annotated[int, at_least(1)],
-        width: Annotated[int, at_least(1)],
-        depth: Annotated[int, at_least(1)],
-        heads: Annotated[int, at_least(1)],
+        width: Annotated[int, WIDTH],
+        depth: Annotated[int, LAYERS],
+        heads: Annotated[int, WIDTH],
         patch: Annotated[int, at_least(1)],
         mlp_ratio: Annotated[float, above(0)],
         max_rad: Annotated[float, above(0)],

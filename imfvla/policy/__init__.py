@@ -16,6 +16,7 @@ from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator
+from imfvla.policy.budget import SizeBudget
 from imfvla.policy.chunks import ChunkFrame
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import robot_of
@@ -123,19 +124,22 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
     try:
         horizon, robot, seen = Horizon(**config["horizon"]), robot_of(config), view_options(config)
         chunks = ChunkFrame(config["action_frame"], horizon.pred, robot)
-        encoder = construct(config["encoder"], "encoder", views=len(seen.views), state_dim=len(robot.state))
-        policy = Policy(
-            horizon=horizon,
-            robot=robot,
-            views=seen.views,
-            image_size=seen.image_size,
-            chunks=chunks,
-            encoder=encoder,
-            core=construct(
-                config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
-            ),
-            generator=construct(config["generator"], "generator", Generator),
-        )
+        with SizeBudget():
+            encoder = construct(
+                config["encoder"], "encoder", views=len(seen.views), state_dim=len(robot.state)
+            )
+            policy = Policy(
+                horizon=horizon,
+                robot=robot,
+                views=seen.views,
+                image_size=seen.image_size,
+                chunks=chunks,
+                encoder=encoder,
+                core=construct(
+                    config["core"], "core", channels=len(robot.action), state_token=encoder.state_token
+                ),
+                generator=construct(config["generator"], "generator", Generator),
+            )
     except KeyError as error:
         raise UserError(
             f"the configuration lacks the key {error.args[0]!r} that a policy is built from."

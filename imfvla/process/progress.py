@@ -11,6 +11,8 @@ from rich import progress as rich_progress
 from rich.console import Console
 from rich.text import Text
 
+from imfvla.process.visible import styled, visible
+
 log = logging.getLogger(__name__)
 
 LINE_EVERY_S = 15.0  # seconds between lines where there is no terminal
@@ -25,7 +27,7 @@ class Progress:
     _display: ClassVar[rich_progress.Progress | None] = None  # of the outermost bar that is entered
 
     def __init__(self, title: str, total: int, done: int = 0, shown: bool = True) -> None:
-        self._title, self._total, self._done, self._already = title, total, done, done
+        self._title, self._total, self._done, self._already = visible(title), total, done, done
         self._shown = shown
         self._bar: rich_progress.Progress | None = None
 
@@ -34,14 +36,14 @@ class Progress:
         if self._shown and sys.stderr.isatty():
             self._is_outermost = Progress._display is None
             self._bar = Progress._display or rich_progress.Progress(
-                rich_progress.TextColumn("{task.description}"),
+                rich_progress.TextColumn("{task.description}", markup=False),
                 rich_progress.BarColumn(),
                 rich_progress.MofNCompleteColumn(),
-                rich_progress.TextColumn("{task.fields[note]}"),
+                rich_progress.TextColumn("{task.fields[note]}", markup=False),
                 rich_progress.TimeElapsedColumn(),
                 rich_progress.TextColumn("left"),
                 _TimeLeft(),
-                console=Console(stderr=True),
+                console=Console(file=styled(sys.stderr)),
             )
             self._task = self._bar.add_task(
                 self._title, total=self._total, completed=self._done, note="", end=None
@@ -60,7 +62,7 @@ class Progress:
         elapsed = now - self._began
         left = elapsed / (self._done - self._already) * (self._total - self._done)
         if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, note=note, end=now + left)
+            self._bar.update(self._task, completed=self._done, note=visible(note), end=now + left)
             return
         if self._shown and (now - self._last_line >= LINE_EVERY_S or self._done == self._total):
             self._last_line = now

@@ -16,6 +16,7 @@ from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from imfvla.errors import UserError
+from imfvla.storage.opening import DATA, open_to_read, size_of
 
 MAGIC = b"\x89MCAP0\r\n"  # at both ends of a file
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -73,8 +74,8 @@ def missing_end(path: Path) -> str | None:
 
     It follows lengths and reads no contents, so a damaged file is not taken for a cut-off one.
     """
-    size = path.stat().st_size
-    with path.open("rb") as stream:
+    with open_to_read(path, DATA) as stream:
+        size = size_of(stream)
         start = stream.read(len(MAGIC))
         if not MAGIC.startswith(start):
             return None
@@ -130,3 +131,23 @@ def clear_read_errors(path: Path) -> Iterator[None]:
             f"Recording {path} is damaged or not an episode of imfvla ({reason}): restore it from a copy, or move it "
             "away and collect or evaluate again."
         ) from error
+
+
+def misplaced_end(data: bytes) -> str | None:
+    """What is wrong with the end of a file whose records are whole: bytes behind it, or an index that is elsewhere."""
+    place, data_end = len(MAGIC), 0
+    while place + RECORD_HEAD.size <= len(data):
+        opcode, length = RECORD_HEAD.unpack_from(data, place)
+        end = place + RECORD_HEAD.size + length
+        if opcode == Opcode.DATA_END:
+            data_end = end
+        elif opcode == Opcode.FOOTER:
+            if behind := len(data) - end - len(MAGIC):
+                return f"{behind} bytes are behind its end"
+            (stated,) = struct.unpack_from("<Q", data, place + RECORD_HEAD.size)
+            wanted = 0 if data_end == place else data_end  # 0 where there is no index
+            return (
+                None if stated == wanted else f"its index begins at byte {wanted}, its footer says {stated}"
+            )
+        place = end
+    return "it has no footer"

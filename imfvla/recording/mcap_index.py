@@ -21,6 +21,7 @@ from imfvla.recording.mcap_file import (
     clear_read_errors,
     records,
 )
+from imfvla.storage.opening import RECORDING, open_to_read, size_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ def read_index(path: str | Path) -> EpisodeIndex:
 
 def _summarised(path: Path) -> EpisodeIndex | None:
     """The index of a file whose writer left counts, metadata and a checksum at its end, else None."""
-    num_bytes = path.stat().st_size
-    with path.open("rb") as stream:
+    with open_to_read(path, RECORDING) as stream:
+        num_bytes = size_of(stream)
         reader = SeekingReader(stream, record_size_limit=num_bytes)
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -72,7 +73,8 @@ def _summarised(path: Path) -> EpisodeIndex | None:
 
 def _counted(path: Path) -> EpisodeIndex:
     """The index of a file with an incomplete summary; the checksum is that of the file."""
-    data = path.read_bytes()
+    with open_to_read(path, RECORDING) as stream:
+        data = stream.read()
     topics: dict[int, str] = {}
     counts: Counter[str] = Counter()
     metadata: dict[str, dict[str, str]] = {}

@@ -12,11 +12,12 @@ from mcap.records import Attachment, Channel, Message, Metadata
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
 from imfvla.recording import messages
-from imfvla.recording.channels import Channels, Misfit
+from imfvla.recording.channels import NUMBERS, Channels, Misfit
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES, clear_read_errors, records
 from imfvla.recording.pictures import decode, size_of
 from imfvla.robot import Camera
 from imfvla.storage.documents import parse_json
+from imfvla.storage.opening import RECORDING, open_to_read
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,9 @@ def read_episode(path: str | Path, *, images: bool | Collection[str] = True) -> 
     """
     path = Path(path)
     with clear_read_errors(path):
-        return _parse(path, path.read_bytes(), images)
+        with open_to_read(path, RECORDING) as stream:
+            data = stream.read()
+        return _parse(path, data, images)
 
 
 def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
@@ -67,7 +70,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         if name not in metadata:
             raise ValueError(f"no metadata record {name}")
     info = messages.read_info(metadata[messages.EPISODE_RECORD], config, path)
-    result = messages.read_result(metadata[messages.RESULT_RECORD])
+    result = messages.read_result(metadata[messages.RESULT_RECORD], path)
 
     times = [time for time, _ in rows.get(messages.STATE, [])]
     num_steps = int(metadata[messages.RESULT_RECORD]["recorded_steps"])
@@ -85,6 +88,8 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         for part in (messages.CLEAN, messages.EXECUTED)
     }
     rewards = [parse_json(text) for _, text in rows.get(messages.REWARD, [])]
+    _check_kinds("reward", [reward["reward"] for reward in rewards], NUMBERS)
+    _check_kinds("stage", [reward["stage"] for reward in rewards], (int,))
     chunks = [parse_json(text) for _, text in rows.get(messages.CHUNK, [])]
     frames = {
         topic.removeprefix(messages.CAMERA): {step_at[time]: text for time, text in row}
@@ -134,17 +139,24 @@ def _channels(
 def _chunk(path: Path, chunk: Mapping[str, Any], channels: Channels) -> np.ndarray:
     """float32 (Tp, A)."""
     actions = chunk["actions"]
+    _check_kinds("chunk", [number for action in actions for number in action], NUMBERS)
     if any(len(action) != len(channels.names) for action in actions):
         problem = Misfit("each action", f"{len(channels.names)} numbers", f"{[len(a) for a in actions][:5]}")
         raise _misfit(path, messages.CHUNK, chunk["step"], problem)
     return _matrix(actions, len(channels.names))
 
 
+def _check_kinds(name: str, values: list[Any], kinds: Collection[type]) -> None:
+    """Raises ValueError where a value is a text or a flag, which an array would take for a number."""
+    if wrong := [value for value in values if type(value) not in kinds]:
+        raise ValueError(f"a {name} of {str(wrong[0])[:80]!r}, wanted a number")
+
+
 def _pictures(path: Path, camera: Camera, encoded: list[bytes]) -> np.ndarray:
     """uint8 (K, H, W, 3)."""
-    pictures = np.empty((len(encoded), camera.height, camera.width, 3), np.uint8)
-    if pictures.nbytes > MAX_EPISODE_BYTES:
+    if len(encoded) * camera.height * camera.width * 3 > MAX_EPISODE_BYTES:
         raise ValueError(f"pictures of more than {MAX_EPISODE_BYTES} bytes")
+    pictures = np.empty((len(encoded), camera.height, camera.width, 3), np.uint8)
     for picture, message in zip(pictures, encoded, strict=True):
         data = messages.camera_bytes(message)
         if (found := size_of(data)) != (camera.height, camera.width):

@@ -15,7 +15,7 @@ from imfvla.recording import messages, schemas
 from imfvla.recording.channels import Channels, numbers
 from imfvla.recording.pictures import encode
 from imfvla.recording.scene import at_time, body_names, frame_transforms, scene_update
-from imfvla.storage.files import write_remedy
+from imfvla.storage.files import make_folder, put_file, write_remedy
 
 TRANSFORMS_HZ = 10  # of /tf messages, at most
 INFO, WARNING = 2, 3  # levels of foxglove.Log
@@ -46,8 +46,9 @@ class McapSink:
 
     def begin(self, env: Environment, info: EpisodeInfo) -> None:
         with self._cleaning_up():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = open(self._part, "wb")  # noqa: SIM115  closed by end or abort
+            make_folder(self.path.parent)
+            self._part.unlink(missing_ok=True)  # of a killed process, or a link to somewhere else
+            self._stream = open(self._part, "xb")  # noqa: SIM115  closed by end or abort
             self._writer = Writer(
                 self._stream, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
             )
@@ -107,7 +108,7 @@ class McapSink:
             self._writer.add_metadata(messages.RESULT_RECORD, messages.result_record(result, self._num_steps))
             self._writer.finish()
             self._stream.close()
-            self._part.replace(self.path)
+            put_file(self._part, self.path)
             self._stream = None
 
     def abort(self) -> None:

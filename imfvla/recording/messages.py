@@ -7,18 +7,18 @@ it, a non-finite one as null.
 
 import base64
 import json
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
+from imfvla.recording.records import Config, InfoRecord, ResultRecord
 from imfvla.robot import RobotSpec
 from imfvla.storage.documents import parse_json
+from imfvla.storage.records import as_record
 from imfvla.tasks.bimanual_robot import bimanual_robot
 
 FORMAT = "2"  # "1" had no robot, which was that of this package's own tasks
@@ -28,6 +28,7 @@ EPISODE_RECORD = "imfvla.episode"  # metadata: EpisodeInfo, written first
 RESULT_RECORD = "imfvla.result"  # metadata: EpisodeResult, written last: a file without it is incomplete
 RECORDS = (EPISODE_RECORD, RESULT_RECORD)
 CONFIG_ATTACHMENT = "config.json"
+REMEDY = "restore it from a copy, or move it away and collect or evaluate again"
 
 CAMERA = "/camera/"
 STATE = "/robot/state"
@@ -39,8 +40,6 @@ REWARD = "/episode/reward"
 LOG = "/episode/log"
 TRANSFORMS = "/tf"
 SCENE = "/scene"
-
-T = TypeVar("T")
 
 
 def time_ns(time_s: float) -> int:
@@ -95,9 +94,12 @@ def read_info(record: dict[str, str], config: dict[str, Any], path: Path) -> Epi
             "that wrote it, or move it away and collect again."
         )
     values = {name: parse_json(text) for name, text in record.items() if name != "format"}
-    values["views"] = tuple(values["views"])
-    values["robot"] = _robot(values, path)
-    return _checked(EpisodeInfo, values | {"config": config})
+    robot = _robot(values, path)
+    parts = as_record(
+        {name: value for name, value in values.items() if name != "robot"}, InfoRecord, str(path), REMEDY
+    )
+    config = as_record(config, Config, f"{path}, {CONFIG_ATTACHMENT}", REMEDY)
+    return EpisodeInfo(**parts | {"views": tuple(parts["views"]), "robot": robot, "config": config})
 
 
 def _robot(values: dict[str, Any], path: Path) -> RobotSpec:
@@ -106,7 +108,7 @@ def _robot(values: dict[str, Any], path: Path) -> RobotSpec:
     if "robot" in values:
         return RobotSpec.from_json(values["robot"], f"{path}: robot")
     height, width = image_size
-    return bimanual_robot(values["views"], (height, width))
+    return bimanual_robot(values["views"], (height, width))  # refuses sizes that no picture has
 
 
 def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:
@@ -117,29 +119,10 @@ def result_record(result: EpisodeResult, num_recorded: int) -> dict[str, str]:
     }
 
 
-def read_result(record: dict[str, str]) -> EpisodeResult:
-    """Inverse of `result_record`."""
+def read_result(record: dict[str, str], path: Path) -> EpisodeResult:
+    """Inverse of `result_record`. Raises UserError naming `path` and the key that is not of its type."""
     values = {name: parse_json(text) for name, text in record.items() if name != "recorded_steps"}
-    for name in ("first_step_of_stage", "inference_ms"):
-        values[name] = tuple(values[name])
-    return _checked(EpisodeResult, values)
-
-
-def _checked(cls: type[T], values: dict[str, Any]) -> T:
-    """`cls(**values)`. Raises ValueError where a value is not of its field's type, which JSON does not guarantee."""
-    for name, hint in get_type_hints(cls).items():
-        if name in values and not _is(values[name], hint):
-            raise ValueError(f"{name} must be {hint}, found {str(values[name])[:80]}")
-    return cls(**values)
-
-
-def _is(value: Any, hint: Any) -> bool:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is UnionType:
-        return any(_is(value, argument) for argument in arguments)
-    if origin is tuple:
-        wanted = arguments[:1] * len(value) if arguments[-1] is ... else arguments
-        return len(value) == len(wanted) and all(map(_is, value, wanted))
-    if hint in (int, float):
-        return isinstance(value, int | hint) and not isinstance(value, bool)
-    return isinstance(value, NoneType if hint is None else Mapping if origin is Mapping else hint)
+    parts = as_record(values, ResultRecord, str(path), REMEDY)
+    return EpisodeResult(
+        **parts | {name: tuple(parts[name]) for name in ("first_step_of_stage", "inference_ms")}
+    )

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 
+from imfvla.config.views import MAX_PIXELS
+
 PNG_LEVEL = 1  # of 9: twice as fast as 3 and a tenth larger on rendered frames
 JPEG_QUALITY = 92
-MAX_PIXELS = 4096 * 4096  # of one picture: a small file can state a size that fills the memory
 
 _PNG_START = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}

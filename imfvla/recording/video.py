@@ -12,7 +12,7 @@ import numpy as np
 from imfvla.environment import Environment
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.storage.files import write_remedy
+from imfvla.storage.files import make_folder, put_file, write_remedy
 
 QUALITY = 20  # x264's constant rate factor: visually lossless is about 18
 FRAMES_HZ = 25  # of videos of faster robots, nearly
@@ -35,7 +35,8 @@ class Mp4Writer:
         self._part = self.path.with_name(f".{self.path.name}.part")
         self._stream = None
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path.parent)
+            self._part.unlink(missing_ok=True)  # of a killed process, or a link to somewhere else
             self._container = av.open(str(self._part), "w", format="mp4", options={"fflags": "+bitexact"})
         except OSError as error:
             raise self._unwritable(error) from error
@@ -61,7 +62,7 @@ class Mp4Writer:
         try:
             self._container.mux(self._stream.encode())
             self._container.close()
-            self._part.replace(self.path)
+            put_file(self._part, self.path)
         except OSError as error:
             self.abort()
             raise self._unwritable(error) from error

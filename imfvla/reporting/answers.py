@@ -3,15 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from math import isclose
 from pathlib import Path
 from typing import Any
 
 from imfvla.errors import UserError
-from imfvla.reporting.episodes import REMEDY, read_episodes
 from imfvla.reporting.mapping import Mapping, TableRow, Wanted
-from imfvla.reporting.metrics import summarise
-from imfvla.reporting.rows import Row
+from imfvla.reporting.records import Row
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
 from imfvla.storage.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps
 from imfvla.storage.run_names import run_name
@@ -108,10 +105,11 @@ class Sources:
                 identity = _identity(evaluation)
                 if evaluation.folder not in taken and identity not in answered:
                     chosen[identity] = evaluation
-        return [
-            [read_evaluated(chosen[identity]) for identity in identities]
-            for _, identities in groupby(sorted(chosen), key=lambda identity: identity[:-1])
-        ]
+        groups = groupby(sorted(chosen), key=lambda identity: identity[:-1])
+        of_seeds = [[chosen[identity] for identity in identities] for _, identities in groups]
+        for found in of_seeds:
+            refuse_copies(found)
+        return [[read_evaluated(evaluation) for evaluation in found] for found in of_seeds]
 
 
 def check_equal_protocols(answers: Sequence[Answer], task: str) -> None:
@@ -165,29 +163,27 @@ def _check_seeds(row: TableRow, found: Sequence[Evaluation]) -> None:
                 f"{row.where} ({row.name}) is answered by runs of different configs, {one.run} and {other.run}: "
                 f"{'; '.join(differing)}. Move one elsewhere."
             )
+    refuse_copies(found)
 
 
 def read_evaluated(evaluation: Evaluation) -> Evaluated:
-    """An evaluation with its episodes. Raises UserError where they are damaged or differ from the summary."""
-    path = evaluation.folder / "episodes.jsonl"
-    episodes = read_episodes(path, evaluation.seeds)
-    for key, value in summarise(episodes).items():
-        if key not in evaluation.summary:
-            continue  # a metric that was added after the evaluation was made
-        stated = evaluation.summary[key]
-        if not _equal(stated, value):
+    """An evaluation with its episodes."""
+    return Evaluated(evaluation, evaluation.episodes)
+
+
+def refuse_copies(found: Sequence[Evaluation]) -> None:
+    """Raises UserError where evaluations of several training seeds are of the same weights, of a copied run."""
+    seen: dict[str, Evaluation] = {}
+    for evaluation in found:
+        weights = evaluation.summary["protocol"].get("weights")
+        if weights in seen:
             raise UserError(
-                f"{path} gives {key} = {value!r}, but its summary.json says {stated!r}: one was changed; {REMEDY}."
+                f"{seen[weights].run} and {evaluation.run} have the same weights ({weights}), so that seeds "
+                f"{seen[weights].training_seed} and {evaluation.training_seed} are one training: move the copy "
+                "elsewhere."
             )
-    return Evaluated(evaluation, episodes)
-
-
-def _equal(told: Any, value: Any) -> bool:
-    if isinstance(value, list) and isinstance(told, list):
-        return len(value) == len(told) and all(map(_equal, told, value))
-    if isinstance(value, float) and isinstance(told, int | float):
-        return isclose(told, value, rel_tol=1e-6)
-    return told == value
+        if weights is not None:
+            seen[weights] = evaluation
 
 
 def _has_weights(run: Path, config: dict[str, Any], row: TableRow) -> bool:

@@ -16,6 +16,9 @@ from imfvla.reporting.measured import Measured
 RESAMPLES = 10_000
 RESAMPLES_OF_PARTS = 2_000  # where only a variance is needed, for the degrees of freedom
 TAILS = (0.025, 0.975)
+# An interval within the range of n numbers holds the middle of what they are drawn from with a probability of at most
+# 1 - 2^(1 - n), which is 95% from 6 on.
+FEWEST_STARTS = 6
 NUMBERS_AT_ONCE = 2_000_000  # bounds what a hierarchical bootstrap needs to some arrays of 16 MB
 
 Statistic = Callable[..., np.ndarray]
@@ -49,7 +52,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
 
     With one training seed a policy: BCa over starts (B. Efron, JASA 82, 1987), and percentiles where the acceleration
     is not defined, as for a median that no single episode moves. With several: `_hierarchical`. Equal numbers
-    throughout give a point; a single start, or a value that is not finite, has no interval.
+    throughout give a point; fewer than `FEWEST_STARTS`, or a value that is not finite, have no interval.
 
     Args:
       statistic: takes the columns of all policies, one after the other.
@@ -67,7 +70,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
         )
     with np.errstate(all="ignore"):
         value = float(statistic(*(column.ravel() for column in columns), axis=-1))
-        if lengths == {1} or not np.isfinite(value):
+        if min(lengths) < FEWEST_STARTS or not np.isfinite(value):
             return Bootstrapped(value)
         if all(np.ptp(column) == 0 for column in columns):
             return Bootstrapped(value, value, value, 0.0)

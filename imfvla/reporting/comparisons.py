@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from imfvla.reporting.contrasts import (
     return_difference,
+    return_ranks,
     return_ratio,
     speedup,
     success_difference,
@@ -36,6 +37,7 @@ class Compared:
     """A row of Table 3. `result` is None where a row is missing, or where `refused` says why there is none.
 
     `detectable` is the smallest result in favour of the row that so many pairs would have shown (see `Contrast`).
+    `p_ranks` and `p_ranks_holm` are of returns by `return_ranks`, the latter with the other comparisons' own tests.
     """
 
     comparison: Comparison
@@ -45,6 +47,8 @@ class Compared:
     p: float | None = None
     p_holm: float | None = None
     test: str | None = None
+    p_ranks: float | None = None
+    p_ranks_holm: float | None = None
     detectable: float | None = None
     refused: str | None = None
 
@@ -58,7 +62,11 @@ def compare(comparisons: Sequence[Comparison], results: Sequence[Result]) -> lis
     named = {result.name: result for result in results}
     compared = [_compare(c, named[c.row.name], named[c.baseline.name]) for c in comparisons]
     corrected = holm([found.p for found in compared])
-    return [replace(found, p_holm=p) for found, p in zip(compared, corrected, strict=True)]
+    by_ranks = holm([found.p if found.p_ranks is None else found.p_ranks for found in compared])
+    return [
+        replace(found, p_holm=p, p_ranks_holm=None if found.p_ranks is None else p_ranks)
+        for found, p, p_ranks in zip(compared, corrected, by_ranks, strict=True)
+    ]
 
 
 def _compare(comparison: Comparison, row: Result, baseline: Result) -> Compared:
@@ -73,11 +81,15 @@ def _compare(comparison: Comparison, row: Result, baseline: Result) -> Compared:
         return replace(compared, refused=reason)
     contrast, is_turned = CONTRASTS[comparison.of, comparison.operation]
     policies = (row.evaluated, baseline.evaluated)
-    found = contrast(Pairs(*(reversed(policies) if is_turned else policies)))
+    pairs = Pairs(*(reversed(policies) if is_turned else policies))
+    found = contrast(pairs)
     result, detectable = found.result, found.detectable
     if contrast is success_difference:  # of episodes, as the paper prints it
         starts = len(row.evaluated[0].episodes)
         result, detectable = result.scaled(starts), None if detectable is None else starts * detectable
     elif is_turned and detectable is not None:
         detectable = 1 / detectable
-    return replace(compared, result=result, p=found.p, test=found.test, detectable=detectable)
+    p_ranks = return_ranks(pairs) if comparison.of == "avg_return" else None
+    return replace(
+        compared, result=result, p=found.p, test=found.test, p_ranks=p_ranks, detectable=detectable
+    )

@@ -13,8 +13,9 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.power import detectable_difference, detectable_share_difference
 from imfvla.reporting.rows import TIMING
-from imfvla.reporting.significance import mcnemar, sign_flip
+from imfvla.reporting.significance import mcnemar, sign_flip, signed_rank
 
+# experiments/protocol.md says which of them is used where
 MCNEMAR, SIGN_FLIP, SEEDS = "exact McNemar", "sign flip", "sign flip, and t over training seeds"
 
 
@@ -59,12 +60,22 @@ def return_ratio(pairs: Pairs) -> Contrast:
 
     Found on logarithms. Infinite where the mean of theirs is 0, None where ours is 0 too.
     """
-    return _ratio(pairs, "total_reward")
+    return _ratio(pairs, "total_reward", return_difference(pairs))
 
 
 def success_ratio(pairs: Pairs) -> Contrast:
-    """As `return_ratio`, of success shares."""
-    return _ratio(pairs, "success")
+    """As `return_ratio`, of success shares; p is of `success_difference`."""
+    return _ratio(pairs, "success", success_difference(pairs))
+
+
+def return_ranks(pairs: Pairs) -> float:
+    """p of the signed-rank test of the returns, of the means over training seeds by start.
+
+    It decides nothing. `experiments/protocol.md` named it until 27 November 2026, so that it is reported beside the
+    test of `return_difference`.
+    """
+    ours, theirs = pairs.columns(itemgetter("total_reward"))
+    return signed_rank(ours.mean(axis=0) - theirs.mean(axis=0))
 
 
 def speedup(pairs: Pairs) -> Contrast:
@@ -92,10 +103,9 @@ def _difference(pairs: Pairs, ours: np.ndarray, theirs: np.ndarray) -> Contrast:
     return Contrast(found.measured, p, test, detectable)
 
 
-def _ratio(pairs: Pairs, key: str) -> Contrast:
+def _ratio(pairs: Pairs, key: str, tested: Contrast) -> Contrast:
     ours, theirs = pairs.columns(itemgetter(key))
     found = bootstrap(_log_ratio, *pairs.policies((ours,), (theirs,)))
-    tested = _difference(pairs, ours, theirs)
     return Contrast(found.exponential, tested.p, tested.test, _detectable_ratio(found))
 
 

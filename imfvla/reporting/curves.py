@@ -4,10 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.errors import UserError
-from imfvla.storage.documents import parse_json, read_lines
-
-REMEDY = "restore or delete the file"
+from imfvla.storage.metrics import read_metrics
 
 
 def learning_curve(run: Path, metric: str = "loss") -> tuple[np.ndarray, np.ndarray]:
@@ -15,21 +12,5 @@ def learning_curve(run: Path, metric: str = "loss") -> tuple[np.ndarray, np.ndar
 
     Raises UserError naming file and line where another line is damaged.
     """
-    path = run / "metrics.jsonl"
-    if not path.exists():
-        return np.empty(0), np.empty(0)
-    lines = read_lines(path, REMEDY)
-    steps, values = [], []
-    for number, line in enumerate(lines, 1):
-        if not line.endswith("\n"):
-            break
-        try:
-            row = parse_json(line)
-            step, value = float(row["step"]), row.get(metric)
-            value = value if value is None else float(value)
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise UserError(f"{path}, line {number} is no row of metrics: {error}; {REMEDY}.") from error
-        if value is not None:
-            steps.append(step)
-            values.append(value)
-    return np.array(steps, float), np.array(values, float)
+    rows = [row for row in read_metrics(run / "metrics.jsonl") if row.get(metric) is not None]
+    return np.array([row["step"] for row in rows], float), np.array([row[metric] for row in rows], float)

@@ -83,11 +83,19 @@ def share_difference(ours: np.ndarray, theirs: np.ndarray) -> Measured:
 
 
 def _located(statistic: Statistic, values: np.ndarray) -> Measured:
-    """With few training seeds an interval is stretched: of numbers that are never negative, no further than to 0."""
+    """With few training seeds an interval is stretched: of numbers that are never negative, no further than to 0.
+
+    Nor beyond 0 of numbers that are never positive.
+    """
     found = bootstrap(statistic, values).measured
-    if found.low is None or np.min(values) < 0:
+    low, high = found.low, found.high
+    if low is None or high is None:
         return found
-    return Measured(found.value, max(found.low, 0.0), found.high)
+    return Measured(
+        found.value,
+        max(low, 0.0) if np.min(values) >= 0 else low,
+        min(high, 0.0) if np.max(values) <= 0 else high,
+    )
 
 
 def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:

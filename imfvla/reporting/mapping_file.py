@@ -1,12 +1,13 @@
 """Reads a file like `experiments/tables.yaml`: mappings that know their lines, and messages that name them."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from imfvla.errors import UserError
-from imfvla.options import suggestion
+from imfvla.options import require, shown, suggestion
 from imfvla.storage.documents import ChosenLoader, read_yaml
 
 _LINE = "__line__"
@@ -24,7 +25,9 @@ def load(path: Path) -> dict[str, Any]:
 def plain(entry: Any, where: str) -> dict[str, Any]:
     """A mapping of the file without its line. Raises UserError where it is none."""
     if not isinstance(entry, dict):
-        raise UserError(f"{where} must be a mapping of keys to values, found {entry!r}.")
+        raise UserError(f"{where} must be a mapping of keys to values, found {shown(entry)}.")
+    for key in entry:
+        require(isinstance(key, str), f"a key of {where}", "a text", key)
     return {key: value for key, value in entry.items() if key != _LINE}
 
 
@@ -37,7 +40,7 @@ def place_of(entry: Any, what: str, path: Path) -> str:
 def entries(content: dict[str, Any], key: str, path: Path) -> list[Any]:
     """The rows of a table. Raises UserError where they are no list."""
     if not isinstance(content[key], list):
-        raise UserError(f"{path}: {key} must be a list of rows, found {content[key]!r}.")
+        raise UserError(f"{path}: {key} must be a list of rows, found {shown(content[key])}.")
     return content[key]
 
 
@@ -53,8 +56,8 @@ class _Loader(ChosenLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         line = node.start_mark.line + 1
-        keys = [key.value for key, _ in node.value]
-        twice = next((key for key in keys if keys.count(key) > 1), None)
+        counts = Counter(str(key.value) for key, _ in node.value)
+        twice = next((key for key, count in counts.items() if count > 1), None)
         if twice is not None:
             raise yaml.constructor.ConstructorError(None, None, f"line {line} has {twice} twice", None)
         return super().construct_mapping(node, deep=True) | {_LINE: line}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A number and its 95% interval; None where there is no such number, or no interval for it."""
+    """A number and its 95% interval; None where there is no such number, or where too few give it for an interval."""
 
     value: float | None
     low: float | None = None

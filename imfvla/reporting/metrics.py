@@ -13,7 +13,8 @@ import numpy as np
 from imfvla.reporting import estimates
 from imfvla.reporting.estimates import wilson_interval
 from imfvla.reporting.measured import Measured
-from imfvla.reporting.rows import TIMING, Row
+from imfvla.reporting.records import Row
+from imfvla.reporting.rows import TIMING
 
 Episodes = Sequence[Row]
 

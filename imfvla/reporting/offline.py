@@ -1,43 +1,68 @@
 """What an offline evaluation found, as tables: of one run by channel and by step, of many runs a row each."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 
+from imfvla.config.horizon import MAX_STEPS
+from imfvla.config.protocol import MAX_EPISODES
 from imfvla.errors import UserError
+from imfvla.options import at_least, at_most, require, within, within_length
 from imfvla.reporting.table import NOTHING, Table, number
 from imfvla.reporting.tables import Document
-from imfvla.storage.documents import read_json
+from imfvla.robot import MAX_CHANNELS
 from imfvla.storage.files import write_text
+from imfvla.storage.records import Duration, Label, Name, Step, read_record
 from imfvla.storage.run_directory import RunDirectory
 
 FILE = "offline.json"
 HOLD, NEAREST = "hold still", "nearest demonstration"
-KEYS = {
-    "experiment": str, "protocol": dict, "decisions": int, "executed": int, "channels": list, "deviation": list,
-    "error": dict,
-}  # fmt: skip
 REMEDY = "move it away and run the training again, which only evaluates"
+# Steps of the chunk, then channels; None where nothing counted.
+Errors = Annotated[list[list[Duration | None]], within_length(1, MAX_STEPS)]
 MEASURE = "Mean absolute error of chunks against what was done at {decisions} decisions of {episodes} held-out episodes"
 
 
-def read_offline(run: RunDirectory) -> dict[str, Any] | None:
+class Protocol(TypedDict):
+    """Which weights were judged on which episodes."""
+
+    checkpoint_step: Step
+    held_out: Annotated[list[Label], at_most(MAX_EPISODES)]  # names of episodes
+
+
+class Offline(TypedDict):
+    """`offline.json`."""
+
+    experiment: Name
+    protocol: Protocol
+    decisions: Annotated[int, at_least(1)]
+    executed: Annotated[int, within(1, MAX_STEPS)]
+    channels: Annotated[list[Label], within_length(1, MAX_CHANNELS)]
+    deviation: list[Duration]
+    error: Annotated[Mapping[str, Errors], at_most(100)]
+
+
+def read_offline(run: RunDirectory) -> Offline | None:
     """The content of a run's offline.json, None without one. Raises UserError where it is damaged."""
     path = run.path / FILE
     if not path.exists():
         return None
-    found = read_json(path, REMEDY, mapping=True)
-    for key, kind in KEYS.items():
-        if not isinstance(found.get(key), kind):
+    found = read_record(path, Offline, REMEDY)
+    where, number = f"{path}: error", len(found["channels"])
+    require(
+        {HOLD, NEAREST} <= found["error"].keys(),
+        where,
+        f"of {HOLD}, of {NEAREST} and of policies",
+        list(found["error"]),
+    )
+    for name, rows in found["error"].items():
+        if len(rows) < found["executed"] or any(len(row) != number for row in rows):
             raise UserError(
-                f"{path}: {key} must be of type {kind.__name__}, found {found.get(key)!r}; {REMEDY}."
+                f"{where} of {name} must be a number for each step and each of {number} channels, found "
+                f"{len(rows)} rows of {len(rows[0])}; {REMEDY}."
             )
-    shape = {_errors(found, name).shape[1:] for name in found["error"]}
-    if shape != {(len(found["channels"]),)} or len(found["deviation"]) != len(found["channels"]):
-        raise UserError(
-            f"{path}: error must have a number for each of {len(found['channels'])} channels; {REMEDY}."
-        )
+    require(len(found["deviation"]) == number, f"{path}: deviation", f"{number} numbers", found["deviation"])
     return found
 
 

@@ -3,14 +3,14 @@
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 from imfvla.reporting.answers import Evaluated
+from imfvla.reporting.escaping import html_text
 from imfvla.reporting.media import Media
 from imfvla.reporting.page_rows import anchor, differences_of, rollouts_of
+from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
-from imfvla.reporting.rows import Row
 from imfvla.reporting.table import FILL, Table
 from imfvla.reporting.table_row import machine
 
@@ -38,7 +38,7 @@ def page(
     named = {result.name: result for result in results}
     sections = [
         *(
-            f'<h2 id="{_id(table.title)}">{escape(table.title)}</h2>{_table(table, named, media)}'
+            f'<h2 id="{_id(table.title)}">{html_text(table.title)}</h2>{_table(table, named, media)}'
             for table in tables
         ),
         '<h2 id="figures">Figures</h2>',
@@ -50,7 +50,7 @@ def page(
     ]
     links = [(table.title, _id(table.title)) for table in tables]
     links += [("Figures", "figures"), ("Differences", "differ"), ("Rows", "rows")]
-    navigation = "".join(f'<a href="#{target}">{escape(name)}</a>' for name, target in links)
+    navigation = "".join(f'<a href="#{target}">{html_text(name)}</a>' for name, target in links)
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{TITLE}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
@@ -65,7 +65,7 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
     every_keys = table.keys or ((),) * len(table.rows)
     shown = [rollouts_of(named[keys[0]], media) if len(keys) == 1 else "" for keys in every_keys]
     heads = [
-        f'<th{_class(n)} aria-sort="none"><button type="button">{escape(name)}</button></th>'
+        f'<th{_class(n)} aria-sort="none"><button type="button">{html_text(name)}</button></th>'
         for name, n in zip(table.columns, numeric, strict=True)
     ]
     heads[1:1] = [f'<th aria-sort="none"><button type="button">{ROLLOUTS}</button></th>'] * any(shown)
@@ -75,12 +75,12 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
         if len(keys) == 1 and keys[0] in named:
             cells[0] = f'<a href="#{_anchor(keys[0])}">{cells[0]}</a>'
         elif len(keys) > 1:
-            cells[0] += "".join(f' <a href="#{_anchor(key)}">{escape(key)}</a>' for key in keys)
+            cells[0] += "".join(f' <a href="#{_anchor(key)}">{html_text(key)}</a>' for key in keys)
         kind = "paper" if "paper" in row else "missing" if "missing" in row else ""
         filled = [f"<td{_class(n)}>{cell}</td>" for cell, n in zip(cells, numeric, strict=True)]
         filled[1:1] = [f"<td>{rollouts}</td>"] * any(shown)
         lines.append(f'<tr class="{kind}">{"".join(filled)}</tr>' if kind else f"<tr>{''.join(filled)}</tr>")
-    notes = "".join(f'<p class="note">{escape(note)}</p>' for note in table.notes)
+    notes = "".join(f'<p class="note">{html_text(note)}</p>' for note in table.notes)
     body = f"<thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody>"
     return f'<div class="scroll"><table class="sortable">{body}</table></div>{notes}{_commands(table)}'
 
@@ -89,15 +89,15 @@ def _cell(text: str, is_number: bool) -> str:
     """A number with its interval below it, whose ends may stand below each other where there is little room."""
     value, bracket, interval = text.partition(" [")
     if not (is_number and bracket):
-        return escape(text)
-    return f'{escape(value)} <span class="interval">[{escape(interval)}</span>'
+        return html_text(text)
+    return f'{html_text(value)} <span class="interval">[{html_text(interval)}</span>'
 
 
 def _commands(table: Table) -> str:
     if not table.commands:
         return ""
     items = "".join(
-        f"<li>{escape(', '.join(names))}:<br><code>{escape(command)}</code></li>"
+        f"<li>{html_text(', '.join(names))}:<br><code>{html_text(command)}</code></li>"
         for command, names in table.by_command().items()
     )
     return f"<details><summary>{FILL}</summary><ul>{items}</ul></details>"
@@ -105,9 +105,9 @@ def _commands(table: Table) -> str:
 
 def _figure(picture: Picture) -> str:
     data = base64.b64encode(picture.svg).decode()
-    caption = escape(picture.caption)
+    caption = html_text(picture.caption)
     return (
-        f'<figure id="{picture.name}"><img alt="{caption}" src="data:image/svg+xml;base64,{data}">'
+        f'<figure id="{html_text(picture.name)}"><img alt="{caption}" src="data:image/svg+xml;base64,{data}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -115,11 +115,11 @@ def _figure(picture: Picture) -> str:
 def _row(result: Result, media: Media) -> str:
     title = f"{result.row.label}, nfe {result.nfe}" if result.row else result.name
     if result.is_missing:
-        content = f"<p>Missing. {FILL}<br><code>{escape(result.answer.command)}</code></p>"
+        content = f"<p>Missing. {FILL}<br><code>{html_text(result.answer.command)}</code></p>"
         title += ": missing"
     else:
         content = "".join(_evaluated(found, media) for found in result.evaluated)
-    return f'<details id="{_anchor(result.name)}"><summary>{escape(title)}</summary>{content}</details>'
+    return f'<details id="{_anchor(result.name)}"><summary>{html_text(title)}</summary>{content}</details>'
 
 
 def _evaluated(found: Evaluated, media: Media) -> str:
@@ -137,8 +137,8 @@ def _evaluated(found: Evaluated, media: Media) -> str:
     folders = [evaluation.run, *(evaluation.run / name for name in RUN_FILES)]
     folders += [evaluation.folder, *(evaluation.folder / name for name in EVALUATION_FILES)]
     recordings = sorted(path for path in evaluation.folder.glob("*") if path.suffix in (".mcap", ".mp4"))
-    links = [anchor(path, media) for path in (*folders, *recordings) if path.exists()]
-    described = "".join(f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in facts.items())
+    links = [anchor(path, evaluation.run, media) for path in (*folders, *recordings) if path.exists()]
+    described = "".join(f"<dt>{name}</dt><dd>{html_text(text)}</dd>" for name, text in facts.items())
     return f"<dl>{described}<dt>files</dt><dd>{' · '.join(links)}</dd></dl>{_episodes(found.episodes)}"
 
 
@@ -166,7 +166,7 @@ def _episodes(episodes: Sequence[Row]) -> str:
             *_stages(row, has_stages),
             row["failure"] or "-",
         )
-        filled = "".join(f'<td class="number">{escape(str(cell))}</td>' for cell in cells)
+        filled = "".join(f'<td class="number">{html_text(str(cell))}</td>' for cell in cells)
         lines.append(f"<tr>{filled}</tr>")
     table = f"<table><thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return f'<details><summary>{len(episodes)} episodes</summary><div class="scroll">{table}</div></details>'
@@ -185,7 +185,7 @@ def _anchor(name: str) -> str:
 
 
 def _id(title: str) -> str:
-    return title.partition(":")[0].lower().replace(" ", "-")
+    return html_text(title.partition(":")[0].lower().replace(" ", "-"))
 
 
 def _class(is_number: bool) -> str:

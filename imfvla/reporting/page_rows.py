@@ -2,10 +2,10 @@
 
 import json
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 from imfvla.reporting.answers import Evaluated
+from imfvla.reporting.escaping import html_json, html_text
 from imfvla.reporting.media import Media
 from imfvla.reporting.results import Result
 from imfvla.storage.run_directory import flatten
@@ -22,24 +22,23 @@ def rollouts_of(result: Result, media: Media) -> str:
     )
 
 
-def anchor(path: Path, media: Media) -> str:
+def anchor(path: Path, run: Path, media: Media) -> str:
     """A link to a file under its own name, or to a directory under its path; the path alone where nothing is linked."""
-    text = escape(path.as_posix() if path.is_dir() else path.name)
-    address = media.link(path)
+    text = html_text(path.as_posix() if path.is_dir() else path.name)
+    address = media.link(path, run)
     return text if address is None else f'<a href="{address}">{text}</a>'
 
 
 def differences_of(results: Sequence[Result]) -> str:
     """Two rows to choose, and the keys in which their configs and evaluations differ."""
     configs = {result.name: _config(result) for result in results if not result.is_missing}
-    data = json.dumps(configs).replace("<", "\\u003c")  # so that no text in it ends the element
-    options = "".join(f'<option value="{escape(name)}">{escape(name)}</option>' for name in configs)
+    options = "".join(f'<option value="{html_text(name)}">{html_text(name)}</option>' for name in configs)
     choices = "".join(
         f'<label>{"Row" if name == "one" else "against row"} <select id="differ-{name}">{options}</select></label>'
         for name in ("one", "other")
     )
     return (
-        f'<script type="application/json" id="configs">{data}</script><p class="choice">{choices}</p>'
+        f'<script type="application/json" id="configs">{html_json(configs)}</script><p class="choice">{choices}</p>'
         '<div class="scroll"><table id="differences"><thead><tr><th>Key</th><th>Row</th><th>Against</th></tr></thead>'
         '<tbody></tbody></table></div><p id="no-difference" class="note" hidden>Nothing.</p>'
         '<noscript><p class="note">This needs JavaScript; config.yaml of each run is linked below.</p></noscript>'
@@ -50,14 +49,14 @@ def _videos(found: Evaluated, media: Media) -> list[str]:
     folder, figures = found.evaluation.folder, []
     for label, recording in found.evaluation.summary.get("recordings", {}).items():
         mcap = folder / recording["file"]
-        video = media.link(mcap.with_suffix(".mp4"))
+        video = media.link(mcap.with_suffix(".mp4"), found.evaluation.run)
         if video is None:
             continue
         caption = f"{label}: seed {recording['seed']}, return {recording['return']:g}"
-        link = f" · {anchor(mcap, media)}" if mcap.exists() else ""
+        link = f" · {anchor(mcap, found.evaluation.run, media)}" if mcap.exists() else ""
         figures.append(
             f'<figure><video controls muted playsinline preload="none" src="{video}"></video>'
-            f"<figcaption>{escape(caption)}{link}</figcaption></figure>"
+            f"<figcaption>{html_text(caption)}{link}</figcaption></figure>"
         )
     return figures
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from imfvla.reporting.answers import Evaluated
-from imfvla.reporting.rows import Row
+from imfvla.reporting.records import Row
 
 SAME = ("task", "variant", "noise_seed", "max_steps")  # of two protocols whose episodes are pairs
 SAME_FOR_TIMES = ("threads", "workers")  # of two fingerprints, besides the machine

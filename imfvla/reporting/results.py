@@ -9,7 +9,7 @@ from imfvla.reporting.mapping import TableRow
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
-from imfvla.reporting.rows import Row
+from imfvla.reporting.records import Row
 
 
 class Result:

@@ -1,22 +1,21 @@
 """The line of `episodes.jsonl` that an episode becomes."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from imfvla.episode import EpisodeResult
+from imfvla.reporting.records import Row
 
-Row = Mapping[str, Any]  # one line of episodes.jsonl
 TIMING = "timing"  # key of a row that holds all that differs between equal runs
 
 
-def row_of(result: EpisodeResult) -> dict[str, Any]:
+def row_of(result: EpisodeResult) -> Row:
     """The line of `episodes.jsonl`: plain values; times are under the last key, inference times rounded to 1 us."""
     return {
         "seed": result.seed,
         "start_digest": result.start_digest,
         "num_steps": result.num_steps,
-        "total_reward": result.total_reward,
-        "max_reward": result.max_reward,
+        "total_reward": float(result.total_reward),
+        "max_reward": float(result.max_reward),
         "success": bool(result.success),
         "first_step_of_stage": list(result.first_step_of_stage),
         "failure": result.failure,

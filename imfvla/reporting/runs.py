@@ -5,32 +5,36 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.config.protocol import REPORTING_SEEDS, USUAL_NOISE, as_recorded
+from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL_NOISE, as_recorded
 from imfvla.errors import UserError
+from imfvla.options import require
 from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.recomputed import recomputed
+from imfvla.reporting.records import Row, Summary
 from imfvla.storage.documents import read_json
+from imfvla.storage.records import as_record
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key
+from imfvla.storage.trained_config import DIGEST, refuse_changed_config, refuse_other_config
 
-REMEDY = ": evaluate again with overwrite=true"
+REMEDY = "evaluate again with overwrite=true"
+# Of a summary, in the order of `table_row.json`.
 METRICS = (
     "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
     "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
     "inference_ms_p95", "success_interval", "failures",
 )  # fmt: skip
-DESCRIPTION = {
-    "experiment": str, "nfe": int, "checkpoint_step": int, "seeds": list, "protocol": dict, "fingerprint": dict,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """One finished evaluation of a run."""
+    """One finished evaluation of a run, every number of it from its episodes."""
 
     run: Path
     folder: Path
-    summary: dict[str, Any]  # `summary.json`, every metric in it, its protocol completed
+    summary: Summary  # `summary.json`, every metric in it, its protocol completed
     config: dict[str, Any]  # `config.yaml` of the run
+    episodes: tuple[Row, ...]  # in the order of their seeds
 
     @property
     def experiment(self) -> str:
@@ -97,7 +101,9 @@ def key_of(run: Path, experiment: str) -> str:
 
 
 def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
-    """All finished evaluations of a run, by folder name. Raises UserError for a broken summary.
+    """All finished evaluations of a run, by folder name.
+
+    Raises UserError for broken summaries and episodes, and where config.yaml is not what was trained and evaluated.
 
     Pass `config` to avoid reading it again.
     """
@@ -141,15 +147,21 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
     path = folder / "summary.json"
-    summary = read_json(path, REMEDY.removeprefix(": "), mapping=True)
-    missing = [key for key in (*METRICS, *DESCRIPTION) if key not in summary]
-    if missing:
-        raise UserError(f"{path} lacks {', '.join(missing)}{REMEDY}.")
-    for key, kind in DESCRIPTION.items():
-        if not isinstance(summary[key], kind):
-            raise UserError(f"{path}: {key} must be of type {kind.__name__}, found {summary[key]!r}{REMEDY}.")
-    seeds = summary["seeds"]
-    if [type(seed) for seed in seeds] != [int, int] or not 0 <= seeds[0] <= seeds[1]:
-        raise UserError(f"{path}: seeds must be [first, last], found {seeds!r}{REMEDY}.")
-    summary |= {"protocol": as_recorded(summary["protocol"])}
-    return Evaluation(run.path, folder, summary, config)
+    summary = read_summary(path, run.path)
+    refuse_changed_config(run, config, summary["checkpoint_step"])
+    refuse_other_config(config, run.path, path, summary.get(DIGEST))
+    summary, episodes = recomputed(folder, summary, home=run.path)
+    return Evaluation(run.path, folder, summary, config, episodes)
+
+
+def read_summary(path: Path, home: Path | None = None) -> Summary:
+    """What a summary in the run `home` says, its protocol completed. Raises UserError for anything else."""
+    found = read_json(path, REMEDY, mapping=True, home=home)
+    found.setdefault("name", path.parent.name)
+    if isinstance(protocol := found.get("protocol"), dict):
+        found |= {"protocol": as_recorded(protocol)}
+    summary = as_record(found, Summary, str(path), REMEDY)
+    first, last = summary["seeds"]
+    wanted = f"[first, last] of at most {MAX_EPISODES} episodes"
+    require(0 <= last - first < MAX_EPISODES, f"{path}: seeds", wanted, summary["seeds"])
+    return summary

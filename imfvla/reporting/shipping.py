@@ -7,14 +7,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from imfvla.config.protocol import REPORTING_FIRST_SEED
 from imfvla.errors import UserError
+from imfvla.options import part_of
 from imfvla.reporting.runs import evaluations
-from imfvla.storage.documents import read_json
-from imfvla.storage.files import clear_write_errors, copy_file, write_json, write_text
+from imfvla.storage.documents import read_lines
+from imfvla.storage.files import clear_write_errors, copy_file, locked, put_folder, write_json, write_text
+from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
 MAX_BYTES = 8_000_000  # of the weights
 THINNING = 10
+TRAIN = ("python", "-m", "imfvla.train")
 RECORDED = ("depth_attention.json",)  # what tools may have added to a run
 
 
@@ -25,8 +29,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
     weights above 8 MB, no reported evaluation, or a target that exists.
     """
-    if target.exists():
-        raise UserError(f"{target} exists already: remove it first.")
+    refuse_existing(target)
     state = run.status().get("state")
     if state != DONE:
         raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
@@ -36,29 +39,45 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
         raise UserError(f"{weights} has {size} bytes: wanted at most {MAX_BYTES}; train a narrower core.")
     reported = [evaluation for evaluation in evaluations(run) if evaluation.is_reporting]
     if not reported:
-        raise UserError(f"{run.path} has no evaluation of the reporting band: first_seed=100000.")
+        raise UserError(
+            f"{run.path} has no evaluation of the reporting band: first_seed={REPORTING_FIRST_SEED}."
+        )
     made_by = provenance(run, weights, [evaluation.summary for evaluation in reported])
     recorded = [run.path / name for name in RECORDED if (run.path / name).exists()]
     copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
-    copied += sorted(weights.parent.iterdir()) if with_weights else []
+    copied += [weights.with_suffix(".json"), weights] if with_weights else []
     copied += [one.folder / name for one in reported for name in ("episodes.jsonl", "summary.json")]
-    rows = run.metrics.read_text(encoding="utf-8").splitlines(keepends=True)
+    rows = read_lines(run.metrics, "restore it or train again")
     part = target.with_name(f".{target.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        for source in copied:
-            copy_file(source, part / source.relative_to(run.path))
-        write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
-        write_json(part / "made_by.json", made_by)
-        with clear_write_errors(target):
-            part.rename(target)
-    finally:
+    with locked(target):
+        refuse_existing(target)
         shutil.rmtree(part, ignore_errors=True)
+        try:
+            for source in copied:
+                copy_file(source, part / source.relative_to(run.path), home=run.path)
+            write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
+            write_json(part / "made_by.json", made_by)
+            with clear_write_errors(target):
+                put_folder(part, target)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
     return made_by
 
 
+def refuse_existing(target: Path) -> None:
+    """Raises UserError where there is something already."""
+    if target.exists():
+        raise UserError(f"{target} exists already: remove it first.")
+
+
 def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
-    """The command that made a run, from the name of its directory and, where the name lost brackets, its config."""
+    """The command that made a run: as it was recorded, which older runs were not.
+
+    Theirs is read from the name of the directory and, where the name lost brackets, from the config.
+    """
+    recorded = run.overrides()
+    if recorded is not None:
+        return shlex.join([*TRAIN, *recorded])
     values = flatten(config)
     name = "" if run.path.name == "default" else run.path.name
     overrides = []
@@ -66,18 +85,18 @@ def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:
         key = text.partition("=")[0]
         value = values.get(key)
         overrides.append(f"{key}=[{','.join(map(str, value))}]" if isinstance(value, list) else text)
-    return shlex.join(["python", "-m", "imfvla.train", f"+exp={config['name']}", *overrides])
+    return shlex.join([*TRAIN, f"+exp={part_of(config, 'name')}", *overrides])
 
 
 def provenance(run: RunDirectory, weights: Path, summaries: list[dict]) -> dict[str, object]:
     """Command, commit, seed and results of a run."""
     config = run.config()
-    made = read_json(weights.with_suffix(".json"), "restore it or train again", mapping=True)
+    made = read_record(weights.with_suffix(".json"), WeightsDescription, "restore it or train again")
     shown = ("success_episodes", "episodes", "avg_return", "median_return", "inference_ms_median")
     return {
         "command": command_of(run, config),
-        "seed": config["seed"],
-        "code": made["fingerprint"]["code"],
+        "seed": part_of(config, "seed"),
+        "code": made["fingerprint"].get("code"),
         "steps": made["step"],
         "train_s": made["train_s"],
         "machine": made["fingerprint"]["machine"],

@@ -40,6 +40,17 @@ def sign_flip(differences: np.ndarray) -> float:
     return (extreme + 1) / (FLIPS + 1)
 
 
+def signed_rank(differences: np.ndarray) -> float:
+    """p-value of F. Wilcoxon's signed-rank test (Biometrics Bulletin 1, 1945) of paired differences (n,).
+
+    It is `sign_flip` of their ranks by size, equal sizes sharing the mean of their ranks; pairs without a difference
+    are left out. It asks about the middle of the differences, not about their mean.
+    """
+    differences = np.asarray(differences, float)
+    differences = differences[differences != 0]
+    return sign_flip(np.sign(differences) * stats.rankdata(np.abs(differences)))
+
+
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Each p-value corrected for all of them (S. Holm, Scand. J. Stat. 6, 1979); None where there is none."""
     known = sorted((p, place) for place, p in enumerate(p_values) if p is not None)

@@ -2,13 +2,24 @@
 
 import csv
 import io
+import math
 import re
+import sys
 from dataclasses import dataclass
 from shutil import get_terminal_size
 
 from rich.console import Console
 from rich.text import Text
 
+from imfvla.process.visible import styled, visible
+from imfvla.reporting.escaping import (
+    csv_cell,
+    latex_cell,
+    latex_text,
+    markdown_cell,
+    markdown_code,
+    markdown_text,
+)
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.terminal import fit
 
@@ -18,11 +29,9 @@ MISSING, REFUSED = "missing", "refused"
 FILL = "What is missing is filled by:"
 VALUE = r"[-+<]?[\d.]+(?:/\d+)?[%×]?"  # a number, a count of so many, a share, a ratio, a bound
 # alone or with its interval, and with its unit
-NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?: \[{VALUE}, {VALUE}\]|-{VALUE})?(?: ms| points)?"
-LATEX = {
-    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
-    "×": r"$\times$", "≥": r"$\geq$", "≤": r"$\leq$", "±": r"$\pm$", "–": "--", "'": r"\textquotesingle{}",
-} | {character: f"\\{character}" for character in "&%$#_{}"}  # fmt: skip
+TOO_FEW = "[too few]"  # for an interval
+INTERVAL = rf" \[{VALUE}, {VALUE}\]|-{VALUE}| {re.escape(TOO_FEW)}"
+NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?:{INTERVAL})?(?: ms| points)?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,27 +55,27 @@ class Table:
     def markdown(self) -> str:
         """A Markdown table under a heading."""
         lines = [self.columns, ("---",) * len(self.columns), *self.rows]
-        body = "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-        )
-        notes = "".join(f"\n{note}\n" for note in self.notes)
+        body = "\n".join("| " + " | ".join(map(markdown_cell, line)) + " |" for line in lines)
+        notes = "".join(f"\n{markdown_text(note)}\n" for note in self.notes)
         commands = "".join(
-            f"- {', '.join(names)}: `{command}`\n" for command, names in self.by_command().items()
+            f"- {markdown_text(', '.join(names))}: {markdown_code(command)}\n"
+            for command, names in self.by_command().items()
         )
         missing = f"\n{FILL}\n\n{commands}" if commands else ""
-        return f"## {self.title}\n\n{body}\n{notes}{missing}"
+        return f"## {markdown_text(self.title)}\n\n{body}\n{notes}{missing}"
 
     def csv(self) -> str:
         """Comma-separated values, names first."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerows([self.columns, *self.rows])
+        for row in (self.columns, *self.rows):
+            writer.writerow(cell if re.fullmatch(NUMERIC, cell) else csv_cell(cell) for cell in row)
         return stream.getvalue()
 
     def latex(self) -> str:
         """A floating table for the packages booktabs and graphicx, scaled to the width of the text."""
         columns = "".join("r" if self.is_numeric(name) else "l" for name in self.columns)
-        lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (self.columns, *self.rows)]
+        lines = [" & ".join(map(latex_cell, row)) + r" \\" for row in (self.columns, *self.rows)]
         notes = [rf"\par\smallskip\footnotesize {latex_text(note)}" for note in self.notes]
         return "\n".join(
             (
@@ -91,17 +100,18 @@ class Table:
     def print(self, console: Console | None = None) -> None:
         """To the terminal, or to `console`, in the layout that fits its width."""
         if console is None:
-            console = Console(width=get_terminal_size((WIDE, 0)).columns)
-        lines = fit(self.columns, self.rows, [self.is_numeric(name) for name in self.columns], console.width)
-        console.print(Text(f"\n{self.title}", "bold"))
+            console = Console(file=styled(sys.stdout), width=get_terminal_size((WIDE, 0)).columns)
+        columns, *rows = (tuple(map(visible, row)) for row in (self.columns, *self.rows))
+        lines = fit(columns, rows, [self.is_numeric(name) for name in self.columns], console.width)
+        console.print(Text(f"\n{visible(self.title)}", "bold"))
         for line in lines:
             console.print(Text(line.text, "bold" if line.is_heading else ""), soft_wrap=not line.is_heading)
         for note in self.notes:
-            console.print(Text(f"\n{note}"))
+            console.print(Text(f"\n{visible(note)}"))
         if self.commands:
             console.print(Text(f"\n{FILL}"))
         for command in self.by_command():
-            console.print(Text(command), soft_wrap=True)  # unbroken, so that it can be copied
+            console.print(Text(visible(command)), soft_wrap=True)  # unbroken, so that it can be copied
 
 
 def number(value: float | None, digits: int) -> str:
@@ -114,16 +124,11 @@ def with_interval(measured: Measured, digits: int, unit: str = "") -> str:
     if measured.value is None:
         return NOTHING
     text = f"{measured.value:.{digits}f}{unit}"
-    return text if measured.low is None else f"{text} {interval(measured, digits, unit)}"
+    return f"{text} {interval(measured, digits, unit)}" if math.isfinite(measured.value) else text
 
 
 def interval(measured: Measured, digits: int, unit: str = "") -> str:
-    """As in "[75.6%, 89.9%]", empty where there is none."""
+    """As in "[75.6%, 89.9%]", or that too few episodes have none."""
     if measured.low is None or measured.high is None:
-        return ""
+        return TOO_FEW
     return f"[{measured.low:.{digits}f}{unit}, {measured.high:.{digits}f}{unit}]"
-
-
-def latex_text(text: str) -> str:
-    """Plain text for LaTeX: its special characters escaped, signs outside of ASCII as commands."""
-    return "".join(LATEX.get(character, character) for character in text)

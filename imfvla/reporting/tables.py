@@ -12,7 +12,7 @@ from imfvla.reporting.notes import detectable_success, pairing
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
-from imfvla.reporting.table import MISSING, NOTHING, REFUSED, Table, with_interval
+from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.storage.run_directory import LAST
 
@@ -140,8 +140,8 @@ def shown(found: Compared) -> str:
     if found.comparison.operation != "difference":
         return with_interval(found.result, 2, "×")
     value = found.result
-    bounds = "" if value.low is None else f" [{value.low:+.1f}, {value.high:+.1f}]"
-    return f"{value.value:+g}{bounds}"
+    bounds = TOO_FEW if value.low is None else f"[{value.low:+.1f}, {value.high:+.1f}]"
+    return f"{value.value:+g} {bounds}"
 
 
 def p_value(p: float | None) -> str:
@@ -218,13 +218,21 @@ def _data_row(result: Result) -> tuple[str, ...]:
 def _comparison_data(compared: Sequence[Compared]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
     columns = (
         "comparison", "metric", "row", "baseline", "of", "operation", "paper", "ours", "ours_low", "ours_high", "p",
-        "p_holm", "status", "reason",
+        "p_holm", "p_signed_rank", "p_signed_rank_holm", "status", "reason",
     )  # fmt: skip
     cells = []
     for found in compared:
         comparison, paper = found.comparison, found.comparison.paper
         result = found.result or Measured(None)
-        numbers = (result.value, result.low, result.high, found.p, found.p_holm)
+        numbers = (
+            result.value,
+            result.low,
+            result.high,
+            found.p,
+            found.p_holm,
+            found.p_ranks,
+            found.p_ranks_holm,
+        )
         cells.append(
             (
                 paper.comparison, paper.metric, found.row.name, found.baseline.name, comparison.of,

@@ -11,7 +11,7 @@ from imfvla.reporting.power import ALPHA, POWER
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import rows
 from imfvla.reporting.significance import holm
-from imfvla.reporting.table import NOTHING, REFUSED, Table, with_interval
+from imfvla.reporting.table import NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.reporting.tables import COLUMNS, ours, p_value
 from imfvla.storage.run_directory import RunDirectory
@@ -167,8 +167,8 @@ def _amount(found: ComparedMeasure) -> str:
     if measure.neutral:
         return with_interval(result, measure.digits, measure.unit)
     form = f"+.{measure.digits}f"
-    bounds = "" if result.low is None else f" [{result.low:{form}}, {result.high:{form}}]"
-    return f"{result.value:{form}}{bounds}{measure.unit}"
+    bounds = TOO_FEW if result.low is None else f"[{result.low:{form}}, {result.high:{form}}]"
+    return f"{result.value:{form}} {bounds}{measure.unit}"
 
 
 def _sentence(found: ComparedMeasure) -> str:
@@ -199,9 +199,10 @@ def _notes(duel: Duel) -> tuple[str, ...]:
         )
     protocol, seeds = duel.ours.evaluation.summary["protocol"], duel.ours.evaluation.seeds
     task = f"{protocol['task']} ({protocol['variant']}), seeds {seeds[0]} to {seeds[-1]}"
+    noise_seed = protocol.get("noise_seed", 0)
     return (
         *described,
-        f"{task}, noise seed {protocol['noise_seed']}. In brackets: 95% intervals. Differences are A minus B, speed is "
+        f"{task}, noise seed {noise_seed}. In brackets: 95% intervals. Differences are A minus B, speed is "
         "B's time over A's. p is two-sided, for one comparison alone and after Holm's correction over the whole table. "
         "Detectable: the smallest difference "
         f"in favour of A that so many pairs would have shown with probability {POWER} at p = {ALPHA}.",

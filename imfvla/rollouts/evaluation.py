@@ -1,8 +1,8 @@
 """Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,11 +13,13 @@ from imfvla.options import require
 from imfvla.process.progress import Progress
 from imfvla.process.workers import Here, Pool, worker_pool
 from imfvla.reporting.metrics import summarise
-from imfvla.reporting.rows import Row
+from imfvla.reporting.records import Row
 from imfvla.rollouts.rollout_log import RolloutLog
 from imfvla.rollouts.workbench import Build, Job, describe_world, load_workbench, record, roll_out
+from imfvla.storage.documents import read_json
 from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory, flatten
+from imfvla.storage.trained_config import DIGEST, digest_of_config, refuse_changed_config, refuse_other_config
 
 REQUIRED_KEYS = ("name", "task.name", "observation.views", "observation.image_size")
 USUAL_VARIANT = "default"  # of a task that has no other
@@ -37,7 +39,8 @@ def evaluate(
       The summaries, in the order of `nfe`.
 
     Raises:
-      UserError: no run, no such weights, no such device, or an episode whose workers died.
+      UserError: no run, no such weights, no such device, an episode whose workers died, or a config.yaml that was
+        changed since the weights were trained or other evaluations were made.
     """
     require_device(options.device, "device")
     config = run.config()
@@ -46,12 +49,13 @@ def evaluate(
         raise UserError(
             f"{run.path}/config.yaml lacks {', '.join(missing)}: wanted the config of a training run."
         )
-    run.refuse_links_outside()
+    run.refuse_strangers()
     step = run.weights_step(options.checkpoint)
-    weights = run.policy_weights(step)
-    if not weights.exists():
-        raise UserError(f"{weights} is missing: train again, or take another checkpoint=...")
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
+    digest = run.weights_digest(step)
+    refuse_changed_config(run, config, step)
+    for path in sorted(run.path.glob("rollouts/*/summary.json")):
+        refuse_other_config(config, run.path, path, _config_digest(path, run.path))
+    config_digest = digest_of_config(config)
     count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
     summaries = []
     with worker_pool(count, options.episode_timeout_s) as run_all:
@@ -80,12 +84,15 @@ def evaluate(
                 options.device,
             )
             name = protocol.name(run.weight_steps()[-1])
-            with RolloutLog(run.rollouts(name), asdict(protocol), overwrite=options.overwrite) as rollouts:
+            with RolloutLog(
+                run.rollouts(name), asdict(protocol), config_digest=config_digest, overwrite=options.overwrite
+            ) as rollouts:
                 if rollouts.summary is None:
                     incidents_before = run_all.incidents
+                    (world,) = run_all(describe_world, [(job,)])
+                    rollouts.begin(gl_renderer=world.renderer)
                     rows = _roll_out_all(job, protocol, rollouts, run_all)
                     files = _record_some(job, rows, rollouts, run_all) if options.recordings else {}
-                    (world,) = run_all(describe_world, [(job,)])
                     summary = {
                         **summarise(rows),
                         "name": name,
@@ -102,6 +109,14 @@ def evaluate(
                     rollouts.finish(rows, summary)
                 summaries.append(rollouts.summary)
     return summaries
+
+
+def _config_digest(summary: Path, home: Path) -> Any:
+    """Of the config that a finished evaluation was made with; None where its summary does not say it."""
+    try:
+        return read_json(summary, "evaluate again", mapping=True, home=home).get(DIGEST)
+    except UserError:  # an evaluation that is not asked for
+        return None
 
 
 def require_device(device: str, key: str) -> None:

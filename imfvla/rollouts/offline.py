@@ -3,7 +3,6 @@
 Shapes: W decisions, N decisions of training episodes, S state, Tp predicted steps, A action.
 """
 
-import hashlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 
 from imfvla.config.protocol import EvaluationOptions
 from imfvla.data import Windows
+from imfvla.data.same_content import refuse_other_content
 from imfvla.errors import UserError
 from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
@@ -22,6 +22,7 @@ from imfvla.sources.opening import open_source
 from imfvla.storage.files import write_json
 from imfvla.storage.fingerprint import fingerprint
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.trained_config import refuse_changed_config, trained_data
 from imfvla.training.checkpoint import load_policy
 from imfvla.training.data import held_out_windows, prepare_windows
 
@@ -38,14 +39,17 @@ def evaluate_offline(
     `config` is the run's, and says where its data lies. For chunks of each of `options.nfe`, for holding still and for
     the actions of the nearest training decision: the mean absolute error (Tp, A) in the units of the channels, over the
     held-out decisions; steps past an episode's end do not count, and are null where none counts. Raises UserError where
-    there are no such weights.
+    there are no such weights, and where these were trained with another config or on other data.
     """
-    windows = prepare_windows(config, open_source(config))
-    unseen = held_out_windows(windows)
     step = run.weights_step(options.checkpoint)
+    refuse_changed_config(run, run.config(), step)
+    windows = prepare_windows(config, open_source(config))
+    # Among other episodes those that are held out may be those that it was trained on.
+    refuse_other_content(trained_data(run, step), windows.store, f"the weights of step {step}")
+    unseen = held_out_windows(windows)
     protocol = {
         "checkpoint_step": step,
-        "weights": hashlib.sha256(run.policy_weights(step).read_bytes()).hexdigest()[:16],
+        "weights": run.weights_digest(step),
         "nfe": list(options.nfe),
         "noise_seed": options.noise_seed,
         "noise_scale": options.noise_scale,

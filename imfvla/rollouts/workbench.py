@@ -1,6 +1,7 @@
 """What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +12,8 @@ import torch
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
 from imfvla.environments.rollout import run_episode
-from imfvla.reporting.rows import Row, row_of, untimed
+from imfvla.reporting.records import Row
+from imfvla.reporting.rows import row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.storage.run_directory import RunDirectory
 
@@ -39,7 +41,11 @@ def load_workbench(run: Path, step: int) -> tuple[Environment, Any]:
     from imfvla.training.checkpoint import load_policy
 
     directory = RunDirectory(run)
-    return environment_of(directory.config()), load_policy(directory, step)
+    with ExitStack() as made:
+        env = made.enter_context(closing(environment_of(directory.config())))
+        policy = load_policy(directory, step)
+        made.pop_all()
+        return env, policy
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES
 from imfvla.robot import MAX_CHANNELS, bare_name, unit_of
 
@@ -26,6 +27,37 @@ def shortened(found: Any, limit: int = 120) -> str:
     """A value as a message shows it: long ones are cut, so that a file cannot fill the screen."""
     text = found if isinstance(found, str) else repr(found)
     return text if len(text) <= limit else f"{text[:limit]}..."
+
+
+@contextmanager
+def read_errors_told(
+    path: Path,
+    wanted: str,
+    copy: str,
+    unsupported: Callable[[Exception], str],
+    damaged: Callable[[Exception], str],
+    of_damage: tuple[type[Exception], ...],
+) -> Iterator[None]:
+    """Turns what a library raises while it reads `path` into a UserError that tells damage from what is not supported.
+
+    Args:
+      wanted: what should be at `path`, where nothing is.
+      copy: the remedy for that.
+      unsupported: the sentence after `path` for a NotImplementedError.
+      damaged: the sentence after `path` for an error of `of_damage`.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except FileNotFoundError as error:
+        raise UserError(f"{path} is missing: wanted {wanted} there; {copy}.") from error
+    except PermissionError as error:  # a file that may be intact is not called damaged
+        raise unreadable(path, error) from error
+    except NotImplementedError as error:
+        raise UserError(f"{path} {unsupported(error)}") from error
+    except of_damage as error:
+        raise UserError(f"{path} {damaged(error)}") from error
 
 
 def missing_extra(extra: str, error: ImportError) -> UserError:

@@ -8,21 +8,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 from imfvla.config.protocol import DEMONSTRATION_SEEDS, MAX_WORKERS, demonstration_seeds
 from imfvla.environments.rollout import run_episode
 from imfvla.errors import UserError
-from imfvla.options import Limit, at_least, build, one_of, part_of, within
+from imfvla.options import Limit, Plain, at_least, build, one_of, part_of, within
 from imfvla.process.progress import Progress
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.sources.demonstrations import Settings, settings_of
-from imfvla.storage.documents import MAX_JSON_BYTES, parse_json, read_text
-from imfvla.storage.files import clear_write_errors, locked, write_json
+from imfvla.storage.files import clear_write_errors, delete_leftovers, locked, put_file, write_json
 from imfvla.storage.fingerprint import physical_cores
+from imfvla.storage.records import Seed, read_record
 
 LOG_NAME = "collection.json"
+
 # A demonstration takes seconds; a worker that takes longer hangs in its graphics driver.
 EPISODE_TIMEOUT_S = 900.0
 NOT_EMPTY = Limit("a text that is not empty", bool)
@@ -33,6 +34,13 @@ OF_DEMONSTRATIONS = Limit(
 # What folders were recorded with before a setting had a name.
 LATER_SETTINGS = {"dwell": 0}
 log = logging.getLogger(__name__)
+
+
+class CollectionLog(TypedDict):
+    """`collection.json`: what a folder was recorded with, and the seeds at which the expert did not succeed."""
+
+    settings: Mapping[str, Plain]
+    failed_seeds: list[Seed]
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +180,7 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     result = run_episode(env, expert, seed, [sink], kind="demonstration", config=settings.to_json())
     with clear_write_errors(path):
         if result.success:
-            trial.replace(path)
+            put_file(trial, path)
         else:
             trial.unlink()
     return seed, result.success
@@ -191,6 +199,7 @@ class _Log:
 
     def __init__(self, directory: Path, settings: Settings) -> None:
         self._path = directory / LOG_NAME
+        delete_leftovers(self._path)
         self._remedy = f"choose another demos.directory, or move {directory} away to record it again"
         env, _ = _stage_for(settings)
         self._settings = json.loads(json.dumps(settings.to_json())) | {"model": env.model_digest()}
@@ -222,10 +231,10 @@ class _Log:
     def _read(self) -> tuple[dict[str, Any], set[int]]:
         """The settings and the seeds that failed."""
         try:
-            found = parse_json(read_text(self._path, MAX_JSON_BYTES))
-            return LATER_SETTINGS | dict(found["settings"]), {int(seed) for seed in found["failed_seeds"]}
-        except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+            found = read_record(self._path, CollectionLog, "restore it")
+        except UserError as error:
             raise UserError(f"{self._path} is damaged ({error}); {self._remedy}.") from error
+        return LATER_SETTINGS | found["settings"], set(found["failed_seeds"])
 
     def _write(self) -> None:
         write_json(self._path, {"settings": self._settings, "failed_seeds": sorted(self.failed)})

@@ -3,11 +3,12 @@
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
 from imfvla.errors import UserError
-from imfvla.storage.files import clear_write_errors
+from imfvla.storage.files import clear_write_errors, locked, make_folder, put_folder
 
 
 class NewFolder:
@@ -20,28 +21,37 @@ class NewFolder:
     def __init__(self, path: Path, close: Callable[[], None], abort: Callable[[], None]) -> None:
         self.path, self._close, self._abort = path, close, abort
         self.part = path.with_name(f".{path.name}.part")
-        if os.path.lexists(path):
-            raise UserError(f"{path} exists already, wanted a new folder: choose another path.")
+        self._refuse_existing()
 
     def __enter__(self) -> Path:
-        with clear_write_errors(self.path):
-            shutil.rmtree(self.part, ignore_errors=True)  # of a killed process
-            self.part.mkdir(parents=True)
+        with ExitStack() as held:
+            held.enter_context(locked(self.path))
+            self._refuse_existing()  # another process may have made it meanwhile
+            with clear_write_errors(self.path):
+                shutil.rmtree(self.part, ignore_errors=True)  # of a killed process
+                make_folder(self.path.parent)
+                self.part.mkdir()
+            self._held = held.pop_all()
         return self.part
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if error is None:
-                with clear_write_errors(self.path):
-                    self._close()
-                    self.part.rename(self.path)
-        except BaseException:
-            self._remove()
-            raise
-        if error is not None:
-            self._remove()
+        with self._held:
+            try:
+                if error is None:
+                    with clear_write_errors(self.path):
+                        self._close()
+                        put_folder(self.part, self.path)
+            except BaseException:
+                self._remove()
+                raise
+            if error is not None:
+                self._remove()
+
+    def _refuse_existing(self) -> None:
+        if os.path.lexists(self.path):
+            raise UserError(f"{self.path} exists already, wanted a new folder: choose another path.")
 
     def _remove(self) -> None:
         self._abort()

@@ -9,27 +9,38 @@ from typing import Any
 import yaml
 
 from imfvla.errors import UserError, unreadable
+from imfvla.storage.opening import JSON, ROWS, YAML, Kind, open_to_read
 
-MAX_JSON_BYTES = 64 * 2**20
+MAX_LINES = 1_000_000  # of JSON
 MAX_YAML_DEPTH = 64
-MAX_YAML_BYTES = 256 * 2**10  # read a hundred times more slowly than JSON; a config has some 4 kB
+MAX_YAML_VALUES = 20_000  # keys, values, lists and mappings; each takes some 0.1 ms
 
 
 class ChosenLoader(yaml.SafeLoader):
-    """Safe, and without aliases, nine lines of which unfold to billions of values."""
+    """Safe, bounded, and without aliases, nine lines of which unfold to billions of values."""
+
+    num_values = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self.num_values += 1
+        if self.num_values > MAX_YAML_VALUES:
+            raise yaml.YAMLError(f"it has more than {MAX_YAML_VALUES} keys and values")
         if self.check_event(yaml.AliasEvent):
             raise yaml.YAMLError(f"line {self.peek_event().start_mark.line + 1} has an alias, wanted values")
         return super().compose_node(parent, index)
 
 
-def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
-    """The value in `path`, with `mapping` a dict. Raises UserError, ending with `remedy`, where it cannot be read."""
+def read_json(path: Path, remedy: str, *, mapping: bool = False, home: Path | None = None) -> Any:
+    """The value in `path`, a file in `home`, with `mapping` a dict.
+
+    Raises UserError, ending with `remedy`, where it cannot be read, and where `storage.opening` refuses it.
+    """
     try:
-        value = parse_json(read_text(path, MAX_JSON_BYTES))
+        value = parse_json(read_text(path, JSON, home=home))
         if mapping and not isinstance(value, dict):
             raise ValueError(f"wanted a mapping, found {type(value).__name__}")
+    except UserError:
+        raise
     except PermissionError as error:  # a file that may be intact must not be deleted
         raise unreadable(path, error) from error
     except (OSError, ValueError) as error:
@@ -37,14 +48,17 @@ def read_json(path: Path, remedy: str, *, mapping: bool = False) -> Any:
     return value
 
 
-def read_yaml(path: Path, loader: type[yaml.SafeLoader] = ChosenLoader) -> Any:
-    """The value in `path`. Raises FileNotFoundError where it is missing, UserError where it cannot be read."""
+def read_yaml(path: Path, loader: type[yaml.SafeLoader] = ChosenLoader, *, home: Path | None = None) -> Any:
+    """The value in `path`, a file in `home`.
+
+    Raises FileNotFoundError where it is missing, UserError where it cannot be read or `storage.opening` refuses it.
+    """
     try:
-        text = read_text(path, MAX_YAML_BYTES)
+        text = read_text(path, YAML, home=home)
         if _bracket_depth(text) > MAX_YAML_DEPTH:
             raise ValueError(f"it is nested deeper than {MAX_YAML_DEPTH} levels")
         return yaml.load(text, Loader=loader)  # a SafeLoader
-    except FileNotFoundError:
+    except (FileNotFoundError, UserError):
         raise
     except Exception as error:  # an impossible date or deep nesting can raise anything
         raise UserError(f"{path} cannot be read as YAML: {' '.join(str(error).split())}") from error
@@ -56,13 +70,13 @@ def _bracket_depth(text: str) -> int:
     return max(accumulate(changes), default=0)
 
 
-def read_text(path: Path, limit: int) -> str:
-    """Text of at most `limit` bytes. Raises OSError or ValueError (no UTF-8, too long)."""
-    with path.open("rb") as stream:
-        data = stream.read(limit + 1)
-    if len(data) > limit:
-        raise ValueError(f"it is longer than {limit} bytes")
-    return data.decode("utf-8")
+def read_text(path: Path, kind: Kind, *, home: Path | None = None) -> str:
+    """Text of a file in `home`.
+
+    Raises OSError, ValueError (no UTF-8), or UserError where `storage.opening` refuses it.
+    """
+    with open_to_read(path, kind, home=home) as stream:
+        return stream.read().decode("utf-8")
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -73,9 +87,17 @@ def parse_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def read_lines(path: Path, remedy: str) -> list[str]:
-    """The lines of a text, ends kept. Raises UserError, ending with `remedy`, where it cannot be read."""
+def read_lines(path: Path, remedy: str, *, home: Path | None = None) -> list[str]:
+    """The lines of a text in `home`, ends kept.
+
+    Raises UserError, ending with `remedy`, where it cannot be read, and where `storage.opening` refuses it.
+    """
     try:
-        return read_text(path, MAX_JSON_BYTES).splitlines(keepends=True)
+        text = read_text(path, ROWS, home=home)
+        if (found := text.count("\n")) > MAX_LINES:
+            raise ValueError(f"it has {found} lines, wanted at most {MAX_LINES}")
+        return text.splitlines(keepends=True)
+    except UserError:
+        raise
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {error}; {remedy}.") from error

@@ -2,7 +2,7 @@
 
 import os
 import platform
-import subprocess
+from collections.abc import Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -12,8 +12,10 @@ import psutil
 
 import imfvla
 from imfvla.config import components
+from imfvla.storage.code_changes import changes_since_commit, commit_of
 
 CPU_FLAGS = ("avx2", "avx512f", "avx512_bf16", "avx512_vnni", "amx_bf16", "amx_tile")
+SHORT = 12  # characters of a commit in messages
 PACKAGES = (
     "torch",
     "numpy",
@@ -34,16 +36,28 @@ def fingerprint(**extra: Any) -> dict[str, Any]:
 
 @cache
 def code_version() -> dict[str, Any]:
-    """Version, commit and whether files differ from it (dirty); the last two are None outside a clone."""
+    """Version, commit, whether files differ from it (dirty), and a digest of those that do (changes).
+
+    New files count, kept results do not: see `imfvla.storage.code_changes`. Outside a clone only the version is known.
+    """
     root = Path(imfvla.__file__).resolve().parents[1]
     # From a wheel the environment itself may lie in the repository of another project.
-    commit = _git(root, "rev-parse", "HEAD") if (root / ".git").exists() else None
-    changes = _git(root, "status", "--porcelain", "--untracked-files=no") if commit else None
+    commit = commit_of(root) if (root / ".git").exists() else None
+    changes = changes_since_commit(root) if commit else None
     return {
         "version": imfvla.__version__,
-        "commit": commit or None,
+        "commit": commit,
         "dirty": None if changes is None else bool(changes),
+        "changes": changes or None,
     }
+
+
+def describe_code(code: Any) -> str:
+    """A code version in a few words: commit, and which changes to it."""
+    if not isinstance(code, Mapping):
+        return "unknown"
+    commit = str(code.get("commit") or f"version {code.get('version')}")[:SHORT]
+    return f"{commit} with changes {code.get('changes') or 'unknown'}" if code.get("dirty") else commit
 
 
 @cache
@@ -84,18 +98,3 @@ def physical_cores() -> int:
     """Physical cores that this process may use; hyper-threads are not counted twice."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(psutil.cpu_count(logical=False) or allowed, allowed))
-
-
-def _git(root: Path, *arguments: str) -> str | None:
-    """The output of git, None where git or the clone is missing."""
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments],
-            capture_output=True,
-            encoding="utf-8",
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()

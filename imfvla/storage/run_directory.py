@@ -1,6 +1,6 @@
 """The run directory: the contract between training, evaluation and tables. Needs neither torch nor mujoco.
 
-config.yaml  status.json  train.log  metrics.jsonl  tensorboard/
+config.yaml  overrides.json  status.json  train.log  metrics.jsonl  tensorboard/
 checkpoints/last/state.safetensors            to resume from, bit for bit
 checkpoints/step-N/policy.{safetensors,json}  averaged weights to use
 rollouts/<evaluation>/
@@ -11,8 +11,8 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,25 @@ from typing import Any
 import yaml
 
 from imfvla.config.protocol import CHECKPOINT, LAST
-from imfvla.errors import UserError
+from imfvla.errors import UserError, unreadable
 from imfvla.options import require
-from imfvla.storage.documents import read_json, read_yaml
-from imfvla.storage.files import clear_write_errors, take_lock, write_json, write_text
+from imfvla.storage.documents import read_yaml
+from imfvla.storage.files import (
+    clear_write_errors,
+    delete_leftovers,
+    make_folder,
+    sync,
+    take_lock,
+    write_json,
+    write_text,
+)
+from imfvla.storage.opening import WEIGHTS, open_to_append, open_to_read, refuse_strangers
+from imfvla.storage.records import STATES, RunConfig, Status, as_record, read_record
 
-RUNNING, DONE, FAILED = "running", "done", "failed"
+OVERRIDES = "overrides.json"
+REMEDY = "delete it; commands are then read from the directory's name"
+RUNNING, DONE, FAILED = STATES
+PARENTS = 3  # runs/<experiment>/<name>, which Hydra makes without forcing them to disk
 # Keys that say how or where a run executes, not what it trains: they neither name nor distinguish runs.
 EXECUTION_KEYS = (
     "evaluation",
@@ -112,6 +125,17 @@ class RunDirectory:
             )
         return int(step)
 
+    def weights_digest(self, step: int | str = LAST) -> str:
+        """16 hex digits of the file that `policy_weights` names. Raises UserError where it cannot be read."""
+        path = self.policy_weights(step)
+        try:
+            with open_to_read(path, WEIGHTS, home=self.path) as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()[:16]
+        except FileNotFoundError:
+            raise UserError(f"{path} is missing: train again, or take another checkpoint=...") from None
+        except PermissionError as error:
+            raise unreadable(path, error) from error
+
     def config(self) -> dict[str, Any]:
         """The resolved config of the run. Raises UserError where there is none or the file is broken."""
         path = self.path / "config.yaml"
@@ -119,18 +143,11 @@ class RunDirectory:
             config = read_yaml(path)
         except FileNotFoundError:
             raise UserError(f"{self.path} is not a run directory: it has no {path.name}.") from None
-        if not isinstance(config, dict):
-            raise UserError(f"{path} must hold a mapping of keys to values, found {type(config).__name__}.")
-        return config
+        return as_record(config, RunConfig, str(path), "restore it from a copy")
 
-    def refuse_links_outside(self) -> None:
-        """Raises UserError where a link would redirect writes to somewhere else."""
-        home = self.path.resolve()
-        for path in self.path.rglob("*"):
-            if path.is_symlink() and not path.resolve().is_relative_to(home):
-                raise UserError(
-                    f"{path} links out of the run directory, to {path.resolve()}: remove that link."
-                )
+    def refuse_strangers(self) -> None:
+        """Raises UserError where a link would redirect writes to somewhere else, or a pipe would block them."""
+        refuse_strangers(self.path)
 
     def training_steps(self) -> int:
         """The number of training steps. Raises UserError where the config does not give it."""
@@ -151,12 +168,25 @@ class RunDirectory:
                 "name=..., or delete that directory if it is not needed."
             )
 
+    def keep_overrides(self, overrides: Sequence[str]) -> None:
+        """Records the overrides of the command that began the run, unless there are none or some are kept already."""
+        path = self.path / OVERRIDES
+        if overrides and not path.exists():
+            write_json(path, list(overrides))
+
+    def overrides(self) -> list[str] | None:
+        """Those of `keep_overrides`, None without any. Raises UserError where the file is broken."""
+        path = self.path / OVERRIDES
+        if not path.exists():
+            return None
+        return read_record(path, list[str], REMEDY)
+
     def status(self) -> dict[str, Any]:
         """The content of status.json, {} before the first one. Raises UserError where it is broken."""
         path = self.path / "status.json"
         if not path.exists():
             return {}
-        return read_json(path, "delete it and run again", mapping=True)
+        return read_record(path, Status, "delete it and run again")
 
     def write_status(self, state: str, **details: Any) -> None:
         """state: running, done or failed; `details` (step, error, ...) replace those of before."""
@@ -170,8 +200,11 @@ class RunDirectory:
         """Held while a process trains here. Raises UserError where another one does."""
         path = self.path / ".lock"
         with clear_write_errors(path):
-            self.path.mkdir(parents=True, exist_ok=True)
-            file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  closed below
+            make_folder(self.path)
+            for parent in [*self.path.absolute().parents][:PARENTS]:
+                with suppress(PermissionError):
+                    sync(parent)
+            file = open_to_append(path)
         with file:
             if not take_lock(file.fileno(), self.path):
                 file.seek(0)
@@ -181,6 +214,16 @@ class RunDirectory:
                 file.truncate(0)
                 file.write(str(os.getpid()))
                 file.flush()
+            for written in (
+                self.path / "config.yaml",
+                self.path / "status.json",
+                self.metrics,
+                self.last_state,
+            ):
+                delete_leftovers(written)
+            for leftover in self.last_state.parent.glob(".tmp*"):  # of versions before
+                with suppress(OSError):
+                    leftover.unlink()
             yield
 
 
@@ -205,9 +248,14 @@ def step_of(steps: int, checkpoint: int | str) -> int:
 
 
 def config_digest(config: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> str:
-    """16 hex digits that change with any key but the ignored ones."""
-    entries = {key: value for key, value in flatten(plain(config)).items() if not _is_ignored(key, ignored)}
-    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()[:16]
+    """16 hex digits that change with any key but the ignored ones and those that follow from others."""
+    return digest_of_entries(flatten(plain(config)), (*ignored, *DERIVED_KEYS))
+
+
+def digest_of_entries(entries: Mapping[str, Any], ignored: tuple[str, ...]) -> str:
+    """16 hex digits of dotted keys and their values, without the ignored keys and what is below these."""
+    kept = {key: value for key, value in entries.items() if not _is_below(key, ignored)}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any], ignored: tuple[str, ...] = ()) -> list[str]:
@@ -239,7 +287,11 @@ def plain(value: Any) -> Any:
 
 
 def _is_ignored(key: str, ignored: tuple[str, ...]) -> bool:
-    return any(key == name or key.startswith(f"{name}.") for name in (*ignored, *DERIVED_KEYS))
+    return _is_below(key, (*ignored, *DERIVED_KEYS))
+
+
+def _is_below(key: str, names: tuple[str, ...]) -> bool:
+    return any(key == name or key.startswith(f"{name}.") for name in names)
 
 
 def _shown(flat: Mapping[str, Any], key: str) -> str:

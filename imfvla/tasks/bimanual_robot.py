@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from imfvla.config.views import require_drawable
 from imfvla.errors import UserError
 from imfvla.robot import Camera, RobotSpec
 
@@ -13,6 +14,7 @@ TIME_LIMIT_STEPS = 700  # of an episode of every task
 # By `task.expert.modes`: the wrists whose way is drawn. Hands point down, so that a wrist's roll is the gripper's yaw.
 DRAWN_WRISTS = {1: (), 2: ("right/joint_7",), 4: ("left/joint_7", "right/joint_7")}
 ALL_VIEWS = ("front", "top", "r_wrist", "l_wrist")
+LARGEST_PICTURE = (960, 1280)  # (H, W) [px]; the scene has a buffer of this size to draw into
 
 
 def bimanual_robot(views: Sequence[str], image_size: Sequence[int]) -> RobotSpec:
@@ -20,8 +22,9 @@ def bimanual_robot(views: Sequence[str], image_size: Sequence[int]) -> RobotSpec
 
     Of each arm, the left one first: 7 joint angles and the gripper's opening. Actions are targets of the same
     channels; a chunk has joints relative to their present angles and openings as they are. Raises UserError for a view
-    that the scene does not have.
+    that the scene does not have, and for pictures that it cannot draw.
     """
+    require_drawable(image_size, LARGEST_PICTURE)
     for view in views:
         if view not in ALL_VIEWS:
             raise UserError(

@@ -3,7 +3,7 @@
 import numpy as np
 from dm_control import composer, mjcf
 
-from imfvla.config.views import LARGEST
+from imfvla.tasks.bimanual_robot import LARGEST_PICTURE
 from imfvla.tasks.robot import TABLE_BIT, Arm, look_at
 
 PHYSICS_TIMESTEP_S = 0.004
@@ -65,8 +65,8 @@ class Scene(composer.Arena):
         root.visual.quality.numslices = 12
         root.visual.quality.numstacks = 8
         root.visual.quality.numquads = 4
-        getattr(root.visual, "global").offwidth = LARGEST[1]
-        getattr(root.visual, "global").offheight = LARGEST[0]
+        getattr(root.visual, "global").offwidth = LARGEST_PICTURE[1]
+        getattr(root.visual, "global").offheight = LARGEST_PICTURE[0]
         root.visual.map.znear = 0.01
         root.visual.headlight.ambient = [0.45, 0.45, 0.45]
         root.visual.headlight.diffuse = [0.15, 0.15, 0.15]

@@ -8,11 +8,11 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -21,27 +21,53 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from imfvla.errors import UserError, unreadable
+from imfvla.options import Number, Plain, at_most, one_of, within
 from imfvla.policy import Policy, build_policy
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import KEY
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.storage.documents import parse_json, read_json
-from imfvla.storage.files import PARTIAL, clear_write_errors, sync, write_atomically, write_json
+from imfvla.storage.files import (
+    PARTIAL,
+    SCRATCH,
+    clear_write_errors,
+    delete_leftovers,
+    make_folder,
+    put_folder,
+    write_atomically,
+    write_json,
+)
+from imfvla.storage.opening import WEIGHTS, Kind, checked
+from imfvla.storage.records import Duration, Step, as_record
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.trained_config import refuse_changed_config
+from imfvla.training.precision import PRECISIONS
 from imfvla.training.sharding import fill, gathered
 
 STATE_FORMAT = "imfvla-state-1"
 WEIGHTS_FORMAT = "imfvla-policy-1"
+MAX_HEADER_BYTES = 16 * 2**20  # of a safetensors file: names, shapes and details
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
-# What the loop resumes from besides the tensors, with types.
-DETAILS = {
-    "step": (int,),
-    "train_s": (int, float),
-    "precision": (str,),
-    "gradient_scale": (float, type(None)),  # None where every step so far was left out
-    "batches": (dict,),
-    "logger": (dict,),
-}
+
+
+class LoggerState(TypedDict):
+    """The interval that has begun: sums of scalars over so many steps."""
+
+    sums: Annotated[Mapping[str, Number], at_most(1000)]
+    count: NotRequired[Step]
+    skipped: NotRequired[Step]
+
+
+class Details(TypedDict):
+    """What the loop resumes from besides the tensors."""
+
+    step: Step
+    train_s: Duration
+    precision: Annotated[str, one_of(*PRECISIONS)]
+    # Of the gradients; None where every step so far was left out.
+    gradient_scale: Annotated[float, within(0, 1e300)] | None
+    batches: Mapping[str, Plain]  # checked by those who load it
+    logger: LoggerState
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +92,15 @@ def save_state(path: Path, state: TrainState, details: Mapping[str, Any], *, wri
     tensors = gathered(tensors, keep=writes)
     if writes:
         header = {"format": STATE_FORMAT, "details": json.dumps(details)}
+        delete_leftovers(path)
         write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
 
-def load_state(path: Path, state: TrainState) -> dict[str, Any]:
+def load_state(path: Path, state: TrainState) -> Details:
     """Fills `state` from a file of `save_state` and returns its details; a mismatch changes nothing."""
-    tensors, header = read_tensors(path)
+    most = 2 * num_bytes(state.policy.parameters())  # AdamW's moments
+    most += num_bytes(state.policy.state_dict().values()) + num_bytes(state.averaged.state_dict().values())
+    tensors, header = read_tensors(path, most)
     if header.get("format") != STATE_FORMAT:
         raise UserError(
             f"{path} is not a training state: wanted format {STATE_FORMAT}, found {header.get('format')!r}."
@@ -116,23 +145,24 @@ def save_weights(
     with clear_write_errors(directory):
         try:
             shutil.rmtree(temporary, ignore_errors=True)
-            temporary.mkdir(parents=True)
+            make_folder(directory.parent)
+            temporary.mkdir()
             write_tensors(temporary / "policy.safetensors", tensors, {"format": WEIGHTS_FORMAT})
-            sync(temporary / "policy.safetensors")
             write_json(temporary / "policy.json", {"format": WEIGHTS_FORMAT, **description})
-            shutil.rmtree(directory, ignore_errors=True)
-            temporary.rename(directory)
-            sync(directory.parent)
+            put_folder(temporary, directory)
         except BaseException:
             with suppress(OSError):
                 shutil.rmtree(temporary, ignore_errors=True)
             raise
 
 
-def load_weights(policy: nn.Module, path: Path) -> None:
-    """Fills `policy` from `policy.safetensors`. Raises UserError naming tensors that do not fit, and how."""
-    tensors, _ = read_tensors(path)
+def load_weights(policy: nn.Module, path: Path, *, home: Path | None = None) -> None:
+    """Fills `policy` from `policy.safetensors`, a file in `home`.
+
+    Raises UserError naming tensors that do not fit, and how, and where the file has more bytes than the policy needs.
+    """
     wanted = policy.state_dict()
+    tensors, _ = read_tensors(path, num_bytes(wanted.values()), home=home)
     _refuse_misfits(path, wanted, tensors)
     with torch.no_grad():
         for name, tensor in wanted.items():
@@ -142,22 +172,42 @@ def load_weights(policy: nn.Module, path: Path) -> None:
 def load_policy(run: RunDirectory, step: int | str = "last") -> Policy:
     """The averaged policy of a run, ready to predict: statistics included, in eval mode, no gradients.
 
-    Raises UserError where the weights do not fit the run's config, or were trained for another robot.
+    Raises UserError where the weights do not fit the run's config, or were trained with another one or for another
+    robot.
     """
-    step = run.weights_step(step)
-    policy = build_policy(run.config(), statistics=None)
+    step, config = run.weights_step(step), run.config()
+    refuse_changed_config(run, config, step)
+    policy = build_policy(config, statistics=None)
     if policy.has_stages:
         policy.begin_step(step - 1, run.training_steps())  # the last one that these weights have learned from
     path = run.policy_weights(step)
-    _refuse_other_robot(policy, path)
-    load_weights(policy, path)
+    _refuse_other_robot(policy, path, run.path)
+    load_weights(policy, path, home=run.path)
     return policy.eval().requires_grad_(False)
 
 
-def _refuse_other_robot(policy: Policy, path: Path) -> None:
+def check_weights(run: RunDirectory, step: int | str = "last") -> None:
+    """Raises UserError where the file of these weights has more bytes than the config's policy needs. Reads none."""
+    path = run.policy_weights(step)
+    if path.exists():
+        policy = build_policy(run.config(), statistics=None)
+        checked(path, _weights_of(num_bytes(policy.state_dict().values())), home=run.path)
+
+
+def num_bytes(tensors: Iterable[Tensor]) -> int:
+    """Of these tensors together."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+
+
+def _weights_of(most: int) -> Kind:
+    """Files that hold no more than `most` bytes of tensors beside their header."""
+    return Kind("file of the configured policy", most + MAX_HEADER_BYTES)
+
+
+def _refuse_other_robot(policy: Policy, path: Path, home: Path) -> None:
     """Raises UserError where the description beside the weights states another robot than the policy's."""
     beside = path.with_suffix(".json")
-    stated = read_json(beside, "restore it", mapping=True).get(KEY) if beside.exists() else None
+    stated = read_json(beside, "restore it", mapping=True, home=home).get(KEY) if beside.exists() else None
     if stated is not None:  # else they are older than the key, and the config decides
         refuse_other_robot(
             RobotSpec.from_json(stated, f"{beside}: {KEY}"),
@@ -170,22 +220,42 @@ def _refuse_other_robot(policy: Policy, path: Path) -> None:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, str]) -> None:
-    """One safetensors file. Raises OSError where it cannot be written."""
+    """One safetensors file. Raises OSError where it cannot be written.
+
+    The library writes a temporary file of a random name first. It lies in a folder of ours, so that what a kill leaves
+    is found and deleted.
+    """
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    scratch = path.with_name(path.name + SCRATCH)
     try:
-        save_file(on_cpu, path, metadata=dict(header))
+        scratch.mkdir()
+        save_file(on_cpu, scratch / path.name, metadata=dict(header))
+        os.replace(scratch / path.name, path)
     except SafetensorError as error:  # it wraps the system's error, whose number appears only in the text
         number = re.search(r"os error (\d+)", str(error))
         if number is None:
             raise OSError(None, str(error)) from error
         raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+    finally:
+        with suppress(OSError):
+            scratch.rmdir()  # works where no file handle is left
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and header of a safetensors file. Raises UserError where it is missing, cut off or broken."""
+def read_tensors(
+    path: Path, most: int | None = None, *, home: Path | None = None
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and header of a safetensors file in `home`.
+
+    Raises UserError where it is missing, cut off or broken, and, before it is read, where it has more than `most` bytes
+    of tensors.
+    """
     try:
-        with safe_open(path, framework="pt") as file:
+        real = checked(path, WEIGHTS if most is None else _weights_of(most), home=home)
+        with safe_open(real, framework="pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except UserError:
+        raise
     except FileNotFoundError:
         raise UserError(f"{path} is missing: the run has no such checkpoint.") from None
     except PermissionError as error:
@@ -202,18 +272,14 @@ def _damaged(path: Path, error: Exception) -> UserError:
     return UserError(f"{path} is cut off or damaged ({error}): restore it, or move it away and train again.")
 
 
-def _read_details(path: Path, header: Mapping[str, str]) -> dict[str, Any]:
+def _read_details(path: Path, header: Mapping[str, str]) -> Details:
     """The details that `save_state` got. Raises UserError where they are not what the loop saves."""
+    remedy = "restore it, or move it away and train again"
     try:
-        details = parse_json(header["details"])
-        kinds = {key: type(details[key]) for key in DETAILS}
-        if any(kinds[key] not in DETAILS[key] for key in DETAILS) or details["step"] < 0:
-            raise ValueError(f"wanted {DETAILS}, found {kinds}")
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} has a damaged header ({error!r}): restore it, or move it away and train again."
-        ) from error
-    return details
+        details = parse_json(header.get("details", ""))
+    except ValueError as error:
+        raise UserError(f"{path} has a damaged header ({error}): {remedy}.") from error
+    return as_record(details, Details, f"{path}, details", remedy)
 
 
 def _refuse_misfits(path: Path, wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:

@@ -10,6 +10,7 @@ from imfvla.config.views import ViewOptions
 from imfvla.data import Augmentation
 from imfvla.options import build, one_of, part_of, within
 from imfvla.policy.chunks import FRAMES
+from imfvla.storage.records import Name
 from imfvla.training.options import OptimOptions, TrainingOptions
 
 
@@ -17,7 +18,7 @@ from imfvla.training.options import OptimOptions, TrainingOptions
 class ExperimentOptions:
     """The keys of train.yaml, without those that say what is built: task, demos, encoder, core and generator."""
 
-    name: str
+    name: Name
     seed: Annotated[int, within(0, MAX_SEED)]
     action_frame: Annotated[str, one_of(*FRAMES)]
     horizon: Horizon

@@ -1,15 +1,16 @@
 """Metrics of a training run: one row of means per interval in metrics.jsonl, and the same in TensorBoard."""
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from imfvla.errors import UserError
-from imfvla.storage.documents import parse_json, read_lines
-from imfvla.storage.files import clear_write_errors, write_text
+from imfvla.storage.files import clear_write_errors, make_folder, sync, write_text
+from imfvla.storage.metrics import read_metrics
+from imfvla.storage.opening import open_to_append
 from imfvla.storage.run_directory import RunDirectory
 
 
@@ -24,12 +25,13 @@ class MetricsLogger:
         self._path = run.metrics
         _truncate(self._path, resumed_step)
         with clear_write_errors(self._path):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(self._path, "a", encoding="utf-8")  # noqa: SIM115
+            make_folder(self._path.parent)
+            self._file = open_to_append(self._path)
+            sync(self._path.parent)
         with clear_write_errors(run.tensorboard):
             self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
         self._sums: dict[str, float] = dict(state["sums"]) if state else {}
-        self._count: int = state["count"] if state else 0
+        self._count: int = state.get("count", 0) if state else 0
         self._skipped: int = state.get("skipped", 0) if state else 0
 
     def add(self, scalars: Mapping[str, float]) -> None:
@@ -54,12 +56,18 @@ class MetricsLogger:
                 self._tensorboard.add_scalar(name, value, step)
         self._sums, self._count, self._skipped = {}, 0, 0
 
+    def sync(self) -> None:
+        """Forces the rows to disk, before a state counts that follows them. TensorBoard's files are left out."""
+        with clear_write_errors(self._path):
+            os.fsync(self._file.fileno())
+
     def state(self) -> dict[str, Any]:
         """Sums of the interval that has begun; JSON-able."""
         return {"sums": dict(self._sums), "count": self._count, "skipped": self._skipped}
 
     def close(self) -> None:
         with clear_write_errors(self._path):
+            os.fsync(self._file.fileno())
             self._file.close()
             self._tensorboard.close()
 
@@ -79,31 +87,14 @@ class SilentLogger(MetricsLogger):
     def write(self, step: int, **extra: float) -> None:
         pass
 
+    def sync(self) -> None:
+        pass
+
     def state(self) -> dict[str, Any]:
         return {}
 
     def close(self) -> None:
         pass
-
-
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl, without a last line that a kill cut off. Raises UserError if damaged."""
-    if not path.exists():
-        return []
-    rows = []
-    lines = read_lines(path, "restore or delete the file")
-    for number, line in enumerate(lines, 1):
-        try:
-            row = parse_json(line)
-            if not isinstance(row, dict) or not isinstance(row.get("step"), int):
-                raise ValueError("wanted a mapping with a step")
-            rows.append(row)
-        except ValueError as error:
-            if number < len(lines):
-                raise UserError(
-                    f"{path}, line {number} is not JSON of a row: {error}; restore or delete the file."
-                ) from error
-    return rows
 
 
 def _truncate(path: Path, step: int) -> None:

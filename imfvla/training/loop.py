@@ -20,7 +20,7 @@ from imfvla.errors import UserError
 from imfvla.nn.compiled import compile_parts
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped, deferred_stop
-from imfvla.storage.fingerprint import code_version, fingerprint, physical_cores
+from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
 from imfvla.training.clipping import Clipping
@@ -29,14 +29,14 @@ from imfvla.training.logger import MetricsLogger, SilentLogger
 from imfvla.training.non_finite import NonFinite, name_cause
 from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.origin import Origin
 from imfvla.training.parallel import Alone
-from imfvla.training.precision import autocast, choose_precision
+from imfvla.training.precision import PRECISIONS, autocast, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.training.sharding import FULL, release, shard, whole
 from imfvla.training.spans import Span, Spans
 from imfvla.types import Batch
 
-PRECISIONS = ("fp32", "bf16")
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
 log = logging.getLogger(__name__)
 
@@ -96,9 +96,11 @@ class Trainer:
         self.train_s = 0.0  # spent in this process and earlier ones
         self._logger_state: dict[str, Any] | None = None
         self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
+        self.origin = Origin(self.description.get("config"))
         precision: str | None = None
         if run.last_state.exists():
             details = load_state(run.last_state, self.state)
+            self.origin.resume(details, run.last_state)
             self.step = self.saved_step = details["step"]
             self.train_s, self._logger_state = details["train_s"], details["logger"]
             precision, self.clipping.scale = details["precision"], details["gradient_scale"]
@@ -245,12 +247,14 @@ class Trainer:
             "train_s": round(self.train_s, 1),
             "precision": self.precision,
             "fingerprint": fingerprint(device=str(self.device), threads=torch.get_num_threads()),
+            **self.origin.versions(),
             **self.description,
         }
         directory = self.run.weights_directory(self.step)
         save_weights(directory, self.ema.policy, description, writes=self.processes.is_first)
 
     def _save_state(self, logger: MetricsLogger) -> None:
+        logger.sync()  # rows up to this step must outlive it
         self.saved_step = self.step
         details = {
             "step": self.step,
@@ -259,7 +263,7 @@ class Trainer:
             "gradient_scale": self.clipping.scale,
             "batches": self.batches.state_dict(),
             "logger": logger.state(),
-            "code": code_version(),
+            **self.origin.to_json(),
         }
         save_state(self.run.last_state, self.state, details, writes=self.processes.is_first)
 

@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch.nn import functional as F
 
+PRECISIONS = ("fp32", "bf16")
 ADVANTAGE = 1.2  # bf16 must be this much faster to justify its rounding
 
 

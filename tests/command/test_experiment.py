@@ -5,6 +5,7 @@ import json
 import pytest
 import torch
 import yaml
+from fakes import FakeEnvironment
 
 from imfvla.command import experiment
 from imfvla.command.composition import compose
@@ -56,7 +57,8 @@ def test_does_all_stages_once(calls, tmp_path):
     assert run.weight_steps() == [2, 4]
     assert [row["step"] for row in read_metrics(run.metrics)] == [1, 2, 3, 4]
     described = json.loads(run.policy_weights().with_suffix(".json").read_text())
-    assert {"step", "seed", "config_digest", "precision", "fingerprint"} <= described.keys()
+    assert {"step", "seed", "data", "precision", "fingerprint"} <= described.keys()
+    assert described["config"] == run.config()
     assert described["fingerprint"]["threads"] == 1
 
     files = {path: path.stat().st_mtime_ns for path in run.path.rglob("*") if path.name != ".lock"}
@@ -120,7 +122,10 @@ def test_execution_keys_may_change_and_others_may_not(calls, tmp_path):
         ("evaluation.workers=-1", r"evaluation\.workers must be null or between 0 and"),
         ("evaluation.episode_timeout_s=-1", r"evaluation\.episode_timeout_s must be null or above 0"),
         ("evaluation.noise_seed=-1", r"evaluation\.noise_seed must be between 0 and"),
-        ("evaluation.first_seed=18446744073709551616", r"evaluation\.first_seed must be between 0 and"),
+        (
+            "evaluation.first_seed=18446744073709551616",
+            r"evaluation\.first_seed must be a whole number up to",
+        ),
         ("evaluation.checkpoint=3", r"checkpoint must be one of the weights .* of the steps 2, 4, found 3"),
         ("evaluation.checkpoint=half", r"evaluation\.checkpoint must be last, a training step"),
         ("augmentation.brightness=9", r"augmentation\.brightness must be at most 1"),
@@ -184,6 +189,9 @@ def test_weights_of_another_method_are_refused(calls, tmp_path):
     config = run.config()
     config["core"]["depth"] += 1
     (run.path / "config.yaml").write_text(yaml.safe_dump(config))
+    with pytest.raises(UserError, match=r"config\.yaml is not what .* trained with: core\.depth was 4, is 5"):
+        load_policy(run)
+    run.policy_weights().with_suffix(".json").unlink()  # weights that do not say what they are
     with pytest.raises(
         UserError, match=r"policy\.safetensors does not fit the configured policy: missing core"
     ):
@@ -237,3 +245,21 @@ def test_foreign_weights_are_reported_before_anything_is_written(calls, tmp_path
         run_experiment(compose("train", [*TINY, *overrides]), RunDirectory(tmp_path / "run"))
     assert not (tmp_path / "run").exists()
     assert calls == []
+
+
+def test_an_environment_that_is_refused_is_closed(monkeypatch):
+    config = compose("train", ["+exp=socket_act"])
+    config["task"]["kind"] = "gymnasium"
+    env = FakeEnvironment()
+    closed = []
+    monkeypatch.setattr(env, "close", lambda: closed.append(env), raising=False)
+    monkeypatch.setattr(experiment, "environment_of", lambda config: env)
+
+    def refuse(*robots, **words):
+        raise UserError("other robots")
+
+    monkeypatch.setattr(experiment, "refuse_other_robot", refuse)
+    monkeypatch.setattr(experiment, "robot_of", lambda config: None)
+    with pytest.raises(UserError, match="other robots"):
+        experiment._check_environment(config)
+    assert closed == [env]

@@ -1,8 +1,9 @@
 """What Hydra offers around a job is honoured in sweeps too, or refused by name before anything runs."""
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
-from imfvla.command.composition import CONFIG_DIRECTORY
+from imfvla.command.composition import CONFIG_DIRECTORY, Places, choices_of, compose
 from imfvla.command.entry import entry_point, output_directory
 from imfvla.train import usage
 
@@ -45,6 +46,22 @@ def test_the_command_line_wins_over_the_choices_of_an_experiment(mine, tmp_path)
 def test_without_a_sweep_the_other_folder_is_looked_in_too(mine, tmp_path):
     command(["--config-dir", mine, "+exp=mine"])
     assert seen(tmp_path) == ["mine 0"]
+
+
+@pytest.mark.parametrize("by", [["--config-dir", "{}"], ["hydra.searchpath=[file://{}]"]])
+def test_what_a_command_composes_itself_is_looked_for_there_too(mine, by):
+    found = {}
+
+    @entry_point("report")
+    def report(config):
+        places = Places.of_command()
+        GlobalHydra.instance().clear()
+        found.update(compose("train", ["+exp=mine"], places), choices=choices_of("exp", "train", places))
+
+    report([text.format(mine) for text in by])
+    assert found["name"] == "mine"
+    assert {"mine", "socket_act"} < set(found["choices"])
+    assert Places.of_command() == Places()
 
 
 @pytest.mark.parametrize("by", [[], ["-m"], ["+sweep=pair"]])

@@ -165,12 +165,13 @@ def test_a_learning_curve_without_its_cut_off_last_line(tmp_path):
     steps, loss = learning_curve(tmp_path)
     assert (steps.tolist(), loss.tolist()) == ([10, 20], [2, 1])
     path.write_text('{"step": 10, "loss": 2.0}\n{"st\n{"step": 20, "loss": 1.0}\n')
-    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is no row of metrics"):
+    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2 is not JSON"):
         learning_curve(tmp_path)
 
 
 def test_depth_weights_as_recorded(tmp_path):
     found = {"experiment": "e", "checkpoint_step": 5, "actions": [[1.0], [0.25, 0.75], [0.5, 0.25, 0.25]]}
+    found["context"] = found["actions"]
     assert read_depth_attention(tmp_path) is None
     (tmp_path / FILE).write_text(json.dumps(found))
     figure = depth_attention([read_depth_attention(tmp_path)])
@@ -190,5 +191,5 @@ def test_no_depth_weights_and_broken_ones(tmp_path):
     assert "tools/depth_attention.py" in texts(figure)[0]
     for text in ("{", "[]", '{"actions": [[1.0]]}', '{"actions": []}'):
         (tmp_path / FILE).write_text(text)
-        with pytest.raises(UserError, match="holds no depth weights"):
+        with pytest.raises(UserError, match=r"depth_attention\.json.*repeat python tools/depth_attention"):
             read_depth_attention(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("gymnasium", reason="the extra gym is not installed")
 
-from worlds import ID, OBSERVATION, config
+from worlds import ID, OBSERVATION, Slider, config
 
 from imfvla.errors import UserError
 from imfvla.gymnasium_env import load, packages
@@ -114,6 +114,15 @@ def test_a_contradiction_is_named(changes, named):
     with pytest.raises(UserError) as error:
         load(config(**changes), OBSERVATION)
     assert named in str(error.value)
+
+
+@pytest.mark.parametrize("changes", [{"kwargs": {"repeatable": False}}, {"robot": {"control_hz": 7}}])
+def test_a_refused_environment_is_closed(changes, monkeypatch):
+    closed = []
+    monkeypatch.setattr(Slider, "close", lambda self: closed.append(self))
+    with pytest.raises(UserError):
+        load(config(**changes), OBSERVATION)
+    assert len(closed) == 1
 
 
 def test_only_registered_packages_are_imported(monkeypatch):

@@ -18,7 +18,7 @@ CONFIG = compose("train", ["+exp=socket_ph32_exec16", "demos.episodes=3", "obser
 def folder(tmp_path):
     for seed in (0, 1, 3, 4, 5):
         recording_path(tmp_path, seed).touch()
-    (tmp_path / LOG_NAME).write_text(json.dumps({"failed_seeds": [2]}))
+    (tmp_path / LOG_NAME).write_text(json.dumps({"settings": {}, "failed_seeds": [2]}))
     return tmp_path
 
 

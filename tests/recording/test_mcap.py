@@ -317,7 +317,7 @@ def test_what_cannot_be_read_is_named(tmp_path):
     with pytest.raises(UserError, match=r"none\.mcap does not exist"):
         read_episode(tmp_path / "none.mcap")
     for read in (read_episode, read_index):
-        with pytest.raises(UserError, match="cannot be read: Is a directory"):
+        with pytest.raises(UserError, match="Wanted a file, found a directory"):
             read(tmp_path)
 
 

@@ -12,8 +12,10 @@ from imfvla.errors import UserError
 from imfvla.reporting.answers import Sources, check_equal_protocols, read_evaluated
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
+from imfvla.reporting.recomputed import digest_of
 from imfvla.reporting.runs import rows
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.trained_config import digest_of_config
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
@@ -136,8 +138,16 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
     text = summary.read_text()
     summary.write_text(json.dumps(json.loads(text) | {"success_episodes": 100}))
     with pytest.raises(
-        UserError, match=r"episodes\.jsonl gives success_episodes = \d+, but its summary\.json says 100"
+        UserError,
+        match=r"episodes\.jsonl gives another success_episodes than its summary\.json: one was changed",
     ):
+        answer("socket_infer2", tmp_path)
+    digest = {"episodes_digest": digest_of(folder / "episodes.jsonl")}
+    summary.write_text(json.dumps(json.loads(text) | digest | {"avg_return": 1234.5}))
+    (found,) = answer("socket_infer2", tmp_path).evaluated
+    assert found.evaluation.summary["avg_return"] == json.loads(text)["avg_return"]
+    summary.write_text(json.dumps(json.loads(text) | {"episodes_digest": "0" * 16}))
+    with pytest.raises(UserError, match=r"episodes\.jsonl was changed after its summary\.json was written"):
         answer("socket_infer2", tmp_path)
     summary.write_text(text)
     episodes = folder / "episodes.jsonl"
@@ -149,13 +159,53 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
 def test_a_metric_that_the_summary_does_not_have_yet_is_left_out(tmp_path, monkeypatch):
     write_evaluation(make_run(tmp_path / "a", "socket_ph32_exec16"), 2)
     monkeypatch.setattr(
-        "imfvla.reporting.answers.summarise", lambda rows: summarise(rows) | {"new_metric": 1}
+        "imfvla.reporting.recomputed.summarise", lambda rows: summarise(rows) | {"new_metric": 1}
     )
     assert [len(found.episodes) for found in read_all(tmp_path)] == [20]
 
 
 def read_all(directory: Path):
     return [read_evaluated(found) for found in Sources([directory]).evaluations[0]]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("nfe", 3), ("checkpoint_step", 7), ("seeds", [100_001, 100_100])]
+)
+def test_a_description_that_contradicts_its_protocol_is_refused(tmp_path, key, value):
+    path = answer_row(tmp_path, ROWS["socket_infer2"]) / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(UserError, match=r"summary\.json states .*, but its protocol has .*one was changed"):
+        Sources([tmp_path])
+
+
+def test_a_copied_run_is_no_second_training_seed(tmp_path):
+    """Its config.yaml says seed 1, and its weights are those of seed 0."""
+    for seed in (0, 1):
+        answer_row(tmp_path, ROWS["socket_l1"], seed=seed, weights="ab" * 8)
+    with pytest.raises(
+        UserError, match=r"have the same weights \((ab)+\), so that seeds 0 and 1 are one training"
+    ):
+        answer("socket_l1", tmp_path)
+
+
+def test_a_copied_run_outside_of_the_tables_is_none_either(tmp_path):
+    for seed in (0, 1):
+        run = make_run(tmp_path / "a" / f"seed={seed}", "a", seed=seed)
+        write_evaluation(run, 2, weights="ab" * 8)
+    with pytest.raises(UserError, match="have the same weights"):
+        Sources([tmp_path]).others([])
+
+
+def test_a_config_that_changed_since_an_evaluation_is_refused(tmp_path):
+    folder = answer_row(tmp_path, ROWS["socket_infer2"])
+    run, path = folder.parents[1], folder / "summary.json"
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    digest = {"config_digest": digest_of_config(config)}
+    path.write_text(json.dumps(json.loads(path.read_text()) | digest))
+    assert len(Sources([tmp_path]).evaluations[0]) == 1
+    (run / "config.yaml").write_text(yaml.safe_dump(config | {"horizon": {"exec": 4}}))
+    with pytest.raises(UserError, match=r"config\.yaml is not what .*summary\.json was evaluated with"):
+        Sources([tmp_path])
 
 
 def test_a_missing_run_is_proposed_with_all_evaluations_of_its_rows(tmp_path):

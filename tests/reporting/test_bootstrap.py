@@ -52,8 +52,17 @@ def test_equal_numbers_give_a_point():
     assert bootstrap(np.mean, np.full((3, 9), 2.5)) == Bootstrapped(2.5, 2.5, 2.5, 0.0)
 
 
-def test_a_single_start_has_no_interval():
-    assert bootstrap(np.mean, [7.0]) == Bootstrapped(7.0)
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_few_starts_have_no_interval_even_of_equal_numbers(number):
+    assert bootstrap(np.mean, np.full(number, 7.0)) == Bootstrapped(7.0)
+    assert bootstrap(np.mean, np.full((3, number), 7.0)) == Bootstrapped(7.0)
+    assert bootstrap(np.mean, np.arange(float(number))).low is None
+
+
+def test_the_fewest_starts_are_those_whose_range_can_hold_the_middle():
+    assert module.TAILS[1] - module.TAILS[0] <= 1 - 2.0 ** (1 - module.FEWEST_STARTS)
+    assert module.TAILS[1] - module.TAILS[0] > 1 - 2.0 ** (2 - module.FEWEST_STARTS)
+    assert bootstrap(np.mean, np.arange(float(module.FEWEST_STARTS))).low is not None
 
 
 @pytest.mark.parametrize("rewarded", [1, 20, 40])

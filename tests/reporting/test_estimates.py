@@ -31,10 +31,12 @@ def test_an_interval_of_rewards_is_never_negative():
     for estimate in (estimates.mean, estimates.median, estimates.interquartile_mean):
         assert estimate(values).low == 0
     assert estimates.mean(values - 1).low < 0
+    for estimate in (estimates.mean, estimates.median, estimates.interquartile_mean):
+        assert estimate(-values).high == 0
 
 
 def test_a_pooled_mean_weighs_every_number_alike():
-    totals, counts = np.array([10.0, 30.0, 8.0, 0.0]), np.array([2, 10, 2, 0])
+    totals, counts = np.tile([10.0, 30.0, 8.0, 0.0], 2), np.tile([2, 10, 2, 0], 2)
     found = estimates.pooled_mean(totals, counts)
     assert found.value == pytest.approx(48 / 14)
     assert 2.999 <= found.low < found.value < found.high <= 5.001

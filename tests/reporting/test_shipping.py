@@ -13,6 +13,9 @@ from imfvla.storage.files import write_json
 from imfvla.storage.run_directory import DONE, RUNNING, RunDirectory
 
 EPISODE = {
+    "seed": 100_000,
+    "start_digest": "0" * 16,
+    "first_step_of_stage": [],
     "total_reward": 900.0,
     "num_steps": 700,
     "max_reward": 5.0,
@@ -30,7 +33,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
         weights = run.weights_directory(step) / "policy.safetensors"
         write_json(
             weights.with_suffix(".json"),
-            {"step": step, "train_s": 60.0, "fingerprint": {"code": "abc", "machine": {}}},
+            {"step": step, "train_s": 60.0, "fingerprint": {"code": {"commit": "abc"}, "machine": {}}},
         )
         weights.write_bytes(bytes(size))
     run.last_state.parent.mkdir()
@@ -38,7 +41,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
     run.metrics.write_text("".join(f'{{"step": {step}}}\n' for step in range(1, 31)))
     folder = run.rollouts("reported")
     folder.mkdir(parents=True)
-    (folder / "episodes.jsonl").write_text(json.dumps(EPISODE) + "\n")
+    (folder / "episodes.jsonl").write_text(json.dumps(EPISODE | {"seed": first_seed}) + "\n")
     (folder / "median.mcap").write_bytes(b"large")
     write_json(
         folder / "summary.json",
@@ -49,7 +52,7 @@ def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int
             "nfe": 1,
             "checkpoint_step": 20,
             "seeds": [first_seed, first_seed],
-            "protocol": {"max_steps": None},
+            "protocol": {"task": "socket", "variant": "default", "max_steps": None},
             "fingerprint": {"machine": {"cpu": "a fast CPU"}},
         },
     )
@@ -72,7 +75,7 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     }
     assert (tmp_path / "shipped" / "metrics.jsonl").read_text().count("\n") == 3
     assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
-    assert (made_by["code"], made_by["seed"]) == ("abc", 3)
+    assert (made_by["code"], made_by["seed"]) == ({"commit": "abc"}, 3)
     assert made_by["results"]["reported"]["success_episodes"] == 1
 
 
@@ -83,6 +86,17 @@ def test_the_command_has_the_lists_that_the_directory_s_name_shows_without_brack
         "python -m imfvla.train +exp=a core=standard 'encoder.vision.hidden=[16,24]' seed=3"
     )
     assert command_of(RunDirectory(tmp_path / "default"), config) == "python -m imfvla.train +exp=a"
+
+
+def test_the_command_is_the_recorded_one_where_there_is_one(tmp_path):
+    run = make_run(tmp_path / "core=standard")
+    run.keep_overrides(["+exp=b", "core=standard", "training.threads=1"])
+    run.keep_overrides(["+exp=b", "evaluation.nfe=[4]"])  # of a later command that only evaluates
+    command = "python -m imfvla.train +exp=b core=standard training.threads=1"
+    assert command_of(run, {"name": "a"}) == command
+    write_json(run.path / "overrides.json", {"a": 1})
+    with pytest.raises(UserError, match=r"overrides\.json.*must be a list, found .*; delete it"):
+        command_of(run, {"name": "a"})
 
 
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from imfvla.reporting import significance
-from imfvla.reporting.significance import holm, mcnemar, sign_flip
+from imfvla.reporting.significance import holm, mcnemar, sign_flip, signed_rank
 
 
 def outcomes(only_ours: int, only_theirs: int, both: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -67,3 +67,32 @@ def test_holm_against_r():
 def test_holm_counts_only_what_was_tested():
     assert holm([None, 0.02, None, 0.03]) == [None, 0.04, None, 0.04]
     assert holm([None]) == [None]
+
+
+def test_signed_ranks_by_hand():
+    assert signed_rank([1.0, 2.0, 3.0]) == 2 / 8
+    assert signed_rank([-1.0, 2.0, 30.0]) == 4 / 8  # rank sums 0, 1, 5 and 6 of the 8 are as far from 3
+    assert signed_rank([0.0, 0.0, 1.0]) == signed_rank([5.0]) == 1.0
+    assert signed_rank([]) == 1.0
+
+
+@pytest.mark.parametrize("number", [3, 8, 15])
+def test_signed_ranks_are_those_of_scipy(number):
+    differences = np.random.default_rng(number).normal(0.3, 1, number)
+    assert signed_rank(differences) == pytest.approx(stats.wilcoxon(differences, method="exact").pvalue)
+
+
+def test_ties_share_the_mean_of_their_ranks():
+    differences = np.array([1, 1, -1, 2, 2, 3, 0, 0, -3, 4], float)
+    kept = differences[differences != 0]
+    ranks = np.array([2, 2, 2, 4.5, 4.5, 6.5, 6.5, 8])
+    signs = 2 * (np.arange(2**8)[:, None] >> np.arange(8) & 1) - 1
+    observed = abs(np.sign(kept) @ ranks)
+    assert signed_rank(differences) == np.mean(np.abs(signs @ ranks) >= observed)
+
+
+def test_where_most_pairs_gain_a_little_and_some_lose_much_only_ranks_differ():
+    """So that p by ranks would not belong to a mean, which is what the tables print."""
+    differences = np.array([10.0] * 90 + [-90.0] * 10)
+    assert sign_flip(differences) > 0.9
+    assert signed_rank(differences) < 0.001

@@ -53,7 +53,9 @@ def test_text_has_the_commands_once():
     ("cell", "is_numeric"),
     [
         ("-", True), ("missing", True), ("1544.75", True), ("84/100", True), ("+15 [+1.0, +29.5]", True),
-        ("1.76× [1.50×, 2.10×]", True), ("15.0-85.0%", True), ("<0.001", True), ("socket_l1", False), ("1 of 2", False),
+        ("1.76× [1.50×, 2.10×]", True), ("15.0-85.0%", True), ("<0.001", True),
+        ("1.25 [too few]", True), ("+2.0 [too few] points", True),
+        ("socket_l1", False), ("1 of 2", False),
     ],
 )  # fmt: skip
 def test_numbers_are_told_from_text(cell, is_numeric):
@@ -62,7 +64,8 @@ def test_numbers_are_told_from_text(cell, is_numeric):
 
 def test_numbers_with_and_without_interval():
     assert with_interval(Measured(1.234, 1.0, 1.5), 2) == "1.23 [1.00, 1.50]"
-    assert with_interval(Measured(1.234), 1, "×") == "1.2×"
+    assert with_interval(Measured(1.234), 1, "×") == "1.2× [too few]"
+    assert with_interval(Measured(float("inf")), 1, "×") == "inf×"
     assert with_interval(Measured(None), 1) == number(None, 1) == "-"
     assert interval(Measured(0.5, 0.25, 0.75).scaled(100), 1, "%") == "[25.0%, 75.0%]"
-    assert interval(Measured(1.0), 1) == ""
+    assert interval(Measured(1.0), 1) == "[too few]"

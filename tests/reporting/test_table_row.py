@@ -12,6 +12,7 @@ from rich.console import Console
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
+from imfvla.reporting.recomputed import digest_of
 from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import print_row
 from imfvla.storage.run_directory import RunDirectory
@@ -27,11 +28,13 @@ def write_evaluation(
     step: int = 20,
     gain: float = 1.0,
     max_steps: int | None = None,
-) -> None:
+    failure: str | None = None,
+) -> Path:
     episodes = [
         {
-            "seed": first_seed + index, "total_reward": gain * (1200.0 + 200 * index), "num_steps": 700,
-            "max_reward": 3.0 + 2 * (index % 2), "success": index % 2 == 1, "failure": None,
+            "seed": first_seed + index, "start_digest": f"{index:016x}", "num_steps": 700,
+            "total_reward": gain * (1200.0 + 200 * index), "max_reward": 3.0 + 2 * (index % 2),
+            "success": index % 2 == 1, "first_step_of_stage": [], "failure": failure,
             "timing": {"wall_s": 2.0, "inference_ms": [4.0, 8.0]},
         }
         for index in range(4)
@@ -42,10 +45,11 @@ def write_evaluation(
         "protocol": {"task": "socket", "variant": "default", "max_steps": max_steps},
         "fingerprint": {"machine": {"cpu": "a fast CPU"}, "workers": 2},
     }  # fmt: skip
-    summary["inference_ms_p95"] = 7.9
     folder = run / "rollouts" / f"seeds{first_seed}_nfe{nfe}_step{step}_{max_steps}"
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in episodes))
     (folder / "summary.json").write_text(json.dumps(summary))
+    return folder
 
 
 def make_run(path: Path, name: str = "socket_ph32_exec16") -> Path:
@@ -98,7 +102,7 @@ def test_a_broken_or_incomplete_summary_is_named(run):
     with pytest.raises(UserError, match=r"summary\.json cannot be read as JSON"):
         rows(RunDirectory(run))
     path.write_text('{"nfe": 1}')
-    with pytest.raises(UserError, match=r"summary\.json lacks episodes, avg_return"):
+    with pytest.raises(UserError, match=r"summary\.json lacks experiment, checkpoint_step"):
         rows(RunDirectory(run))
 
 
@@ -130,7 +134,25 @@ def test_what_was_just_evaluated_may_be_printed_alone(run):
 
 
 def test_failed_episodes_are_reported(run):
-    path = next(run.glob("rollouts/*_nfe4_*/summary.json"))
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"failures": {"non-finite action": 2}}))
+    write_evaluation(run, 4, failure="non-finite action")
     print_row(RunDirectory(run), Console(quiet=True))
-    assert "NFE 4: 2 failed with non-finite action." in (run / "table_row.md").read_text()
+    assert "NFE 4: 4 failed with non-finite action." in (run / "table_row.md").read_text()
+
+
+def test_a_number_that_was_written_into_the_summary_is_not_printed(run):
+    folder = write_evaluation(run, 1)
+    path = folder / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"avg_return": 1234.5}))
+    with pytest.raises(UserError, match=r"episodes\.jsonl gives another avg_return than its summary\.json"):
+        print_row(RunDirectory(run), Console(quiet=True))
+    digest = {"episodes_digest": digest_of(folder / "episodes.jsonl")}
+    path.write_text(json.dumps(json.loads(path.read_text()) | digest))
+    print_row(RunDirectory(run), Console(quiet=True))
+    assert (run / "table_row.md").read_text() == EXPECTED
+    assert "1234.5" not in (run / "table_row.json").read_text()
+
+
+def test_a_run_without_its_rows_is_refused(run):
+    (write_evaluation(run, 1) / "episodes.jsonl").unlink()
+    with pytest.raises(UserError, match=r"episodes\.jsonl is missing beside its summary\.json"):
+        print_row(RunDirectory(run), Console(quiet=True))

@@ -220,6 +220,7 @@ def test_an_evaluation_from_before_noise_had_a_scale_is_not_repeated(run):
     path = run.rollouts(NAME) / "summary.json"
     del summary["protocol"]["noise_scale"]
     path.write_text(json.dumps(summary))
+    summary["protocol"]["noise_scale"] = 1.0
     assert roll(run) == [summary]
 
 
@@ -277,3 +278,81 @@ def test_the_episode_of_a_worker_that_died_is_played_again_and_counted(run):
     (summary,) = roll(run, build=build_that_dies_once, workers=1, overwrite=True)
     assert untimed_lines(run.rollouts(NAME)) == before
     assert (undisturbed["worker_incidents"], summary["worker_incidents"]) == (0, 1)
+
+
+def left_over(run: RunDirectory, monkeypatch) -> list[int]:
+    """The seeds that are played from now on, with two rows of an interrupted evaluation left."""
+    played: list[int] = []
+    original = workbench.run_episode
+
+    def killed_at_third(env, actor, seed, *args, **options):
+        played.append(seed)
+        if len(played) == 3:
+            raise KeyboardInterrupt
+        return original(env, actor, seed, *args, **options)
+
+    monkeypatch.setattr(workbench, "run_episode", killed_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        roll(run)
+    return played
+
+
+def test_rows_of_another_renderer_are_not_mixed_in(run, monkeypatch, caplog):
+    played = left_over(run, monkeypatch)
+    monkeypatch.setattr(FakeEnvironment, "renderer", lambda self: "llvmpipe")
+    (summary,) = roll(run)
+    assert played[3:] == list(range(100_000, 100_006))
+    assert summary["fingerprint"]["gl_renderer"] == "llvmpipe"
+    assert "is damaged or of another gl_renderer: starting over" in caplog.text
+
+
+def test_rows_of_other_code_are_not_mixed_in(run, monkeypatch):
+    played = left_over(run, monkeypatch)
+    code = {"version": "0", "commit": "a" * 40, "dirty": True, "changes": "12"}
+    monkeypatch.setattr("imfvla.rollouts.rollout_log.code_version", lambda: code)
+    roll(run)
+    assert played[3:] == list(range(100_000, 100_006))
+
+
+def test_a_finished_evaluation_without_its_rows_is_refused(run):
+    (summary,) = roll(run)
+    episodes = run.rollouts(NAME) / "episodes.jsonl"
+    episodes.unlink()
+    with pytest.raises(UserError, match=r"episodes\.jsonl is missing .*evaluate again with overwrite=true"):
+        roll(run)
+    (again,) = roll(run, overwrite=True)
+    assert again["avg_return"] == summary["avg_return"]
+    episodes.write_text(episodes.read_text().replace('"success": true', '"success": false'))
+    with pytest.raises(UserError, match=r"episodes\.jsonl was changed after its summary\.json was written"):
+        roll(run)
+
+
+def test_numbers_come_from_the_rows(run, caplog):
+    (summary,) = roll(run)
+    path = run.rollouts(NAME) / "summary.json"
+    path.write_text(json.dumps(summary | {"avg_return": 1234.5, "success_of_goal": {"a": [1, 1]}}))
+    (found,) = roll(run)
+    assert found == summary
+    assert "summary.json was changed: its avg_return is not that of the episodes" in caplog.text
+
+
+@pytest.mark.parametrize("first_seed", [100_000, 200_000])
+def test_a_changed_config_gives_no_old_summary_and_no_rows_beside_old_ones(run, first_seed):
+    roll(run)
+    config = yaml.safe_load((run.path / "config.yaml").read_text())
+    (run.path / "config.yaml").write_text(yaml.safe_dump(config | {"horizon": {"exec": 4}}))
+    with pytest.raises(
+        UserError, match=rf"config\.yaml is not what .*{NAME}/summary\.json was evaluated with"
+    ):
+        roll(run, first_seed=first_seed)
+    assert [path.name for path in run.path.glob("rollouts/*")] == [NAME]
+
+
+def test_the_keys_that_differ_from_the_training_are_named(run):
+    config = yaml.safe_load((run.path / "config.yaml").read_text())
+    trained = {"config": config | {"horizon": {"exec": 16}}}
+    (run.weights_directory(20) / "policy.json").write_text(json.dumps(trained))
+    (run.path / "config.yaml").write_text(yaml.safe_dump(config | {"horizon": {"exec": 4}}))
+    with pytest.raises(UserError, match=r"horizon\.exec was 16, is 4\. Restore config\.yaml"):
+        roll(run)
+    assert not list(run.path.glob("rollouts/*"))

@@ -113,7 +113,7 @@ def test_a_damaged_file_is_named(run):
     content = json.loads((run.path / "offline.json").read_text())
     for damage in ({"channels": ["a"]}, {"error": None}, {"decisions": "many"}):
         (run.path / "offline.json").write_text(json.dumps(content | damage))
-        with pytest.raises(UserError, match=r"offline\.json: .*move it away"):
+        with pytest.raises(UserError, match=r"offline\.json.*move it away"):
             read_offline(run)
 
 

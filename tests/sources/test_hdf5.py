@@ -167,7 +167,7 @@ def virtual(path):
 
 DEMO = "data/demo_0"
 huge_pictures = set_dataset(
-    f"{DEMO}/obs/agentview_image", shape=(6, 9**5, 9**4, 3), dtype="u1", chunks=(1, 8, 8, 3)
+    f"{DEMO}/obs/agentview_image", shape=(6, 16_000, 16_000, 3), dtype="u1", chunks=(1, 8, 8, 3)
 )
 
 

@@ -79,7 +79,7 @@ def test_a_lock_is_waited_for_and_where_none_can_be_written_not(tmp_path):
 
 
 def test_a_copy_is_made_where_it_differs(tmp_path):
-    source, copy = tmp_path / "source", tmp_path / "media" / "copy"
+    source, copy = tmp_path / "source.log", tmp_path / "media" / "copy.log"
     source.write_text("one")
     copy_file(source, copy)
     made = copy.stat().st_ino

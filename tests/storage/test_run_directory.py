@@ -45,7 +45,11 @@ def test_ignored_keys_may_differ():
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "is not a run directory"), ("a: [", "cannot be read as YAML"), ("- 1", "must hold a mapping")],
+    [
+        (None, "is not a run directory"),
+        ("a: [", "cannot be read as YAML"),
+        ("- 1", "must be a mapping of keys"),
+    ],
 )
 def test_broken_config_is_reported(tmp_path, content, message):
     if content is not None:

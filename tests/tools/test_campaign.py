@@ -41,7 +41,7 @@ class Pretended(TOOL.Campaign):
         (run.path / "config.yaml").write_text(yaml.safe_dump(config))
         for step in (STEPS // 3, STEPS):
             weights = run.weights_directory(step) / "policy.safetensors"
-            fingerprint = {"code": "abc", "machine": {}}
+            fingerprint = {"code": {"commit": "abc"}, "machine": {}}
             write_json(
                 weights.with_suffix(".json"), {"step": step, "train_s": 1.0, "fingerprint": fingerprint}
             )

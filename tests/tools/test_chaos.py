@@ -25,12 +25,24 @@ def test_killed_and_stopped_work_comes_back_to_the_same_result():
     assert "exit codes [130, 138, 143]" in printed
 
 
+def test_silent_changes_are_refused_by_name_or_change_nothing():
+    printed = chaos("changes")
+    assert printed.startswith("changes: 3 changes of a training's data")
+    assert "all refused by name, or without effect" in printed
+
+
 def test_a_killed_sweep_comes_to_the_same_end():
     assert "parts of 2 runs equal bit for bit" in chaos("sweep")
 
 
 def test_torchrun_brings_back_what_one_death_ended():
     assert chaos("torchrun").startswith("torchrun: 1 kills")
+
+
+def test_strangers_collisions_and_leftovers_do_no_harm():
+    printed = chaos("strangers", "publications", "no_locks", "nfs", "leftovers")
+    assert "none followed or waited for" in printed
+    assert "none failed, none were mixed" in printed
 
 
 def test_the_harness_tells_a_difference(tmp_path, capsys):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
-from tiny_policy import ACTION, STATE, STEPS, CountedBatches, TinyPolicy
+from tiny_policy import ACTION, OPTIM, OPTIONS, STATE, STEPS, CountedBatches, TinyPolicy
 from torch import nn
 
 from imfvla.errors import UserError
@@ -20,8 +20,9 @@ from imfvla.generators.staged import StagedMeanFlow
 from imfvla.nn.residual import StandardResidual
 from imfvla.nn.transformer import TransformerCore
 from imfvla.process.signals import Stopped
+from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.logger import read_metrics
-from imfvla.training.loop import choose_device, step_seed
+from imfvla.training.loop import Trainer, choose_device, step_seed
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
 
@@ -96,7 +97,11 @@ def untimed_metrics(run) -> list[dict]:
 
 def assert_same_run(one, other):
     """Weights, average, moments, counters and metrics are equal bit for bit."""
-    assert details_of(one.last_state) == details_of(other.last_state)
+    details = [details_of(run.last_state) for run in (one, other)]
+    for found in details:  # somebody may edit a file in the meantime
+        found.pop("earlier_code", None)
+        del found["code"]
+    assert details[0] == details[1]
     paths = [one.last_state, *(one.policy_weights(step) for step in one.weight_steps())]
     others = [other.last_state, *(other.policy_weights(step) for step in other.weight_steps())]
     assert len(paths) == len(others) == 3
@@ -198,6 +203,40 @@ def test_resumes_after_sigkill(tmp_path, make_trainer):
     whole.train()
     resumed.train()
     assert_same_run(whole.run, resumed.run)
+
+
+def test_other_code_is_said_and_kept_where_a_training_resumes(tmp_path, make_trainer, monkeypatch, caplog):
+    old = {"version": "0", "commit": "a" * 40, "dirty": False, "changes": None}
+    new = old | {"dirty": True, "changes": "12"}
+    for dies_at, code in ((1, old), (1, new), (None, new)):
+        monkeypatch.setattr("imfvla.training.origin.code_version", lambda code=code: code)
+        policy = None if dies_at is None else DiesAt(dies_at, Killed())
+        with nullcontext() if dies_at is None else pytest.raises(Killed):
+            make_trainer(tmp_path, policy).train()
+    assert (
+        caplog.text.count("resuming with other code: was aaaaaaaaaaaa, is aaaaaaaaaaaa with changes 12") == 1
+    )
+    run = make_trainer(tmp_path).run
+    earlier = [{"until_step": 1, "code": old}]
+    details = details_of(run.last_state)
+    assert (details["code"], details["earlier_code"]) == (new, earlier)
+    assert json.loads((run.weights_directory(4) / "policy.json").read_text())["earlier_code"] == earlier
+
+
+def test_a_training_does_not_resume_with_another_config(tmp_path, make_trainer):
+    def trainer(rate: float, dies_at: int | None = None) -> Trainer:
+        policy = TinyPolicy() if dies_at is None else DiesAt(dies_at, Killed())
+        config = {"optim": {"lr": rate}, "training": {"threads": dies_at}}
+        options = (CountedBatches(), RunDirectory(tmp_path), OPTIONS, OPTIM)
+        return Trainer(policy, *options, seed=7, description={"config": config})
+
+    with pytest.raises(Killed):
+        trainer(0.1, dies_at=2).train()
+    with pytest.raises(
+        UserError, match=r"state\.safetensors was saved with another config: optim\.lr was 0\.1, is 0\.2"
+    ):
+        trainer(0.2)
+    assert trainer(0.1).step == 2
 
 
 def test_finished_run_does_nothing(tmp_path, make_trainer):

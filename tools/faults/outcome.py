@@ -13,7 +13,7 @@ from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
-NOT_OF_WORK = {"train_s", "code"}  # of a state's header: somebody may commit in the meantime
+NOT_OF_WORK = {"train_s", "code", "earlier_code"}  # of a state's header: somebody may commit in the meantime
 
 
 class Differs(Exception):

@@ -17,6 +17,11 @@ from imfvla.sources import collection
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.loop import Trainer
 
+OF_FAKES = {  # of the config of a run that is evaluated
+    "task": {"name": "fake", "variant": "default"},
+    "observation": {"views": ["front"], "image_size": [16, 16]},
+}
+
 
 def train(folder: Path, steps: int, save_every_s: float = 0.0) -> None:
     """A whole training, by default with a state after every step."""
@@ -31,12 +36,15 @@ def roll_out(folder: Path, episodes: int) -> None:
     run = RunDirectory(folder)
     run.weights_directory(1).mkdir(parents=True, exist_ok=True)
     (run.weights_directory(1) / "policy.safetensors").write_bytes(b"read by nobody")
-    observation = {"views": ["front"], "image_size": [16, 16]}
-    config = {"name": "chaos", "task": {"name": "fake", "variant": "default"}, "observation": observation}
-    (folder / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    (folder / "config.yaml").write_text(yaml.safe_dump({"name": "chaos", **OF_FAKES}), encoding="utf-8")
+    play(folder, episodes)
+
+
+def play(folder: Path, episodes: int) -> None:
+    """An evaluation of a run whose config has what OF_FAKES says."""
     workbench._bench.cache_clear()
     options = EvaluationOptions(episodes=episodes, first_seed=100_000, nfe=(1,), workers=0)
-    evaluate(run, options, build=build_fakes)
+    evaluate(RunDirectory(folder), options, build=build_fakes)
 
 
 class Demonstrator:

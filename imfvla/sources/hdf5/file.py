@@ -10,6 +10,7 @@ from imfvla.errors import UserError, unreadable
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES
 from imfvla.recording.pictures import decode, size_of
 from imfvla.sources.checks import MAX_STEPS, bounded_pictures, misfit, missing_extra, numbers, shortened
+from imfvla.storage.opening import ANYWHERE, DATA, checked
 
 try:
     import h5py
@@ -25,7 +26,7 @@ CHOOSE = "correct the keys in the options"
 def opened(path: Path) -> Iterator[h5py.File]:
     """The file, for reading. Raises UserError where it is missing or no whole HDF5 file."""
     try:
-        with h5py.File(path, "r", locking="best-effort") as file:
+        with h5py.File(checked(path, DATA, home=ANYWHERE), "r", locking="best-effort") as file:
             yield file
     except UserError:
         raise

@@ -32,6 +32,7 @@ from imfvla.sources.hdf5.file import (
     read_numbers,
     read_pictures,
 )
+from imfvla.storage.opening import real_path
 
 SUFFIXES = (".hdf5", ".h5")
 
@@ -219,6 +220,8 @@ def _files(path: Path, where: str) -> list[Path]:
         raise UserError(
             f"{where}.path must be an HDF5 file or a folder of them (*.hdf5, *.h5), found none at {path}: correct it."
         )
+    for file in found:
+        real_path(file)
     return sorted(found, key=lambda file: _natural(file.name))
 
 

@@ -124,7 +124,7 @@ def _stored_robot(info: Info, state: tuple[str, ...], action: tuple[str, ...]) -
     if not path.is_file():
         return None
     try:
-        robot = RobotSpec.from_json(read_json(path, DOWNLOAD, mapping=True))
+        robot = RobotSpec.from_json(read_json(path, DOWNLOAD, mapping=True, home=info.home))
     except UserError as error:
         raise UserError(f"{path}: {error} Correct the file, or copy the data set again.") from error
     return robot if (robot.state, robot.action) == (state, action) else None
@@ -135,7 +135,7 @@ def _stated_range(info: Info, features: Sequence[Feature]) -> Range | None:
     path = info.root / STATS
     if not path.is_file():
         return None
-    stats = read_json(path, DOWNLOAD, mapping=True)
+    stats = read_json(path, DOWNLOAD, mapping=True, home=info.home)
     found = [_range_of(stats, feature, path) for feature in features]
     if None in found:
         return None

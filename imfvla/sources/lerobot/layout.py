@@ -71,6 +71,10 @@ class Info:
     def root(self) -> Path:
         return self.path.parents[1]
 
+    @property
+    def home(self) -> Path:
+        return home_of(self.root)
+
     def data_file(self, chunk: int, file: int) -> Path:
         return inside(self, "data_path", self.data_path, chunk_index=chunk, file_index=file)
 
@@ -78,6 +82,12 @@ class Info:
         if self.video_path is None:
             raise misfit(self.path, "video_path", "a text, since there are videos", None, DOWNLOAD)
         return inside(self, "video_path", self.video_path, video_key=key, chunk_index=chunk, file_index=file)
+
+
+def home_of(root: Path) -> Path:
+    """Where files of the data set in `root` may lie: there, or beside it in the Hub's cache, whose files are links."""
+    real = root.resolve()
+    return real.parents[1] if real.parent.name == "snapshots" else real
 
 
 def read_info(root: Path) -> Info:
@@ -88,7 +98,7 @@ def read_info(root: Path) -> Info:
         raise UserError(
             f"No LeRobot data set at {root}: wanted {INFO} there, found {found}; correct the path."
         )
-    values = read_json(path, DOWNLOAD, mapping=True)
+    values = read_json(path, DOWNLOAD, mapping=True, home=home_of(root))
     version = str(values.get("codebase_version"))
     if not re.fullmatch(r"v?3(\.\d+)*", version):
         raise misfit(
@@ -154,7 +164,7 @@ def inside(info: Info, key: str, template: str, **values: str | int) -> Path:
     """The file that a path with holes such as {chunk_index:03d} names.
 
     The holes are filled here, since a format of Python can reach attributes and state any width. Raises UserError
-    where the file is not in the data set's folder, or in the blobs of the Hub's cache that holds it.
+    where the file is not where `home_of` says.
     """
 
     def filled(hole: re.Match[str]) -> str:
@@ -166,12 +176,8 @@ def inside(info: Info, key: str, template: str, **values: str | int) -> Path:
     name = _HOLE.sub(filled, template)
     if re.search(r"[{}\0]", name) or len(name) > 1000:
         raise misfit(info.path, key, f"a path with holes for {', '.join(values)}", template, DOWNLOAD)
-    root = info.root.resolve()
-    allowed = [root]
-    if root.parent.name == "snapshots":
-        allowed.append(root.parents[1] / "blobs")
     path = info.root / name
-    if ".." in Path(name).parts or not any(path.resolve().is_relative_to(folder) for folder in allowed):
+    if ".." in Path(name).parts or not path.resolve().is_relative_to(info.home):
         raise misfit(
             info.path, key, "a path inside the data set", shortened(name), "use a data set that you trust"
         )

@@ -1,15 +1,22 @@
 """Parquet files of a LeRobot data set, in bounded memory: only the columns and rows that are asked for."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from imfvla.errors import UserError, unreadable
-from imfvla.sources.checks import MAX_EPISODES, MAX_STEPS, misfit, missing_extra, shortened
+from imfvla.sources.checks import (
+    MAX_EPISODES,
+    MAX_STEPS,
+    misfit,
+    missing_extra,
+    read_errors_told,
+    shortened,
+)
 from imfvla.sources.lerobot.layout import DOWNLOAD, INFO, TASKS, Info
+from imfvla.storage.opening import ANYWHERE, DATA, checked
 
 try:
     import pyarrow as pa
@@ -20,6 +27,8 @@ except ImportError as error:
 
 BATCH = 1024  # rows in memory at a time
 MAX_TASKS, MAX_SENTENCE = 100_000, 10_000
+# What a damaged file makes pyarrow raise.
+OF_DAMAGE = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, OverflowError, RuntimeError)
 MAX_ROW_BYTES = 2 * 2**30  # of the rows of one episode
 MAX_GROUP_VALUES = 2**28  # of a column of a row group: a list of equal numbers takes no space in the file
 
@@ -46,7 +55,7 @@ def read_episodes(info: Info, video_keys: Sequence[str]) -> Episodes:
     times = [f"videos/{key}/from_timestamp" for key in video_keys]
     names = [*whole, *places, *times]
     found: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    total = sum(_num_rows(path) for path in files)
+    total = sum(_num_rows(path, info.home) for path in files)
     if total != info.num_episodes:
         raise misfit(
             info.root / "meta/episodes",
@@ -99,7 +108,7 @@ def read_episodes(info: Info, video_keys: Sequence[str]) -> Episodes:
 def read_tasks(info: Info) -> dict[int, str]:
     """The sentence of each task_index. Raises UserError where the table is missing or damaged."""
     path = info.root / TASKS
-    with clear_errors(path), pq.ParquetFile(path) as file:
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=info.home)) as file:
         if file.metadata.num_rows > MAX_TASKS:
             raise misfit(path, "its number of rows", f"at most {MAX_TASKS}", file.metadata.num_rows, DOWNLOAD)
         names = file.schema_arrow.names
@@ -124,8 +133,11 @@ def read_rows(path: Path, columns: Sequence[str], first: int, count: int) -> pa.
 
 
 def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -> Iterator[pa.Table]:
-    """The rows from `first` on, at most `BATCH` at a time; only row groups with wanted rows are read."""
-    with clear_errors(path), pq.ParquetFile(path, memory_map=True) as file:
+    """The rows from `first` on, at most `BATCH` at a time; only row groups with wanted rows are read.
+
+    `path` is a file that `layout.inside` gave, or one checked to lie in the data set.
+    """
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=ANYWHERE), memory_map=True) as file:
         known = file.schema_arrow.names
         if lacking := [name for name in columns if name not in known]:
             raise misfit(
@@ -202,41 +214,27 @@ def _plain(column: pa.Array, name: str, path: Path) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def _num_rows(path: Path) -> int:
-    with clear_errors(path), pq.ParquetFile(path) as file:
+def _num_rows(path: Path, home: Path) -> int:
+    with clear_errors(path), pq.ParquetFile(checked(path, DATA, home=home)) as file:
         count = file.metadata.num_rows
     if count > MAX_EPISODES:
         raise misfit(path, "its number of rows", f"at most {MAX_EPISODES}", count, DOWNLOAD)
     return count
 
 
-@contextmanager
-def clear_errors(path: Path) -> Iterator[None]:
+def clear_errors(path: Path) -> AbstractContextManager[None]:
     """Turns what pyarrow raises into a UserError that tells damage from what is not supported."""
-    try:
-        yield
-    except UserError:
-        raise
-    except FileNotFoundError as error:
-        raise UserError(f"{path} is missing: wanted a parquet file there; {DOWNLOAD}.") from error
-    except PermissionError as error:
-        raise unreadable(path, error) from error
-    except NotImplementedError as error:  # pyarrow's too
-        raise UserError(
-            f"{path} is not supported by pyarrow {pa.__version__} ({shortened(_line(error))}): rewrite it with LeRobot."
-        ) from error
-    except (
-        pa.ArrowException,
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        OverflowError,
-        RuntimeError,
-    ) as error:
-        raise UserError(
-            f"{path} is no whole parquet file ({shortened(_line(error))}); {DOWNLOAD}."
-        ) from error
+    return read_errors_told(
+        path,
+        "a parquet file",
+        DOWNLOAD,
+        # pyarrow's own error of that kind is a NotImplementedError too
+        lambda error: (
+            f"is not supported by pyarrow {pa.__version__} ({shortened(_line(error))}): rewrite it with LeRobot."
+        ),
+        lambda error: f"is no whole parquet file ({shortened(_line(error))}); {DOWNLOAD}.",
+        OF_DAMAGE,
+    )
 
 
 def _line(error: Exception) -> str:

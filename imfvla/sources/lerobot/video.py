@@ -10,6 +10,7 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.sources.checks import bounded_pictures, misfit, shortened
 from imfvla.sources.lerobot.layout import DOWNLOAD
+from imfvla.storage.opening import ANYWHERE, DATA, checked
 
 TOLERANCE = 0.1  # of a period: how far a frame may lie from its time
 
@@ -24,7 +25,7 @@ def read_frames(path: Path, times_s: np.ndarray, fps: float, size: tuple[int, in
     frames = np.empty((len(times_s), *size, 3), np.uint8)
     try:
         # The format is stated, since a playlist that is named .mp4 would open other files.
-        with av.open(str(path), format="mp4") as container:
+        with av.open(str(checked(path, DATA, home=ANYWHERE)), format="mp4") as container:
             if not container.streams.video:
                 raise misfit(path, "its streams", "a video", "none", DOWNLOAD)
             stream = container.streams.video[0]

@@ -2,16 +2,17 @@
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mcap.records import Channel, Message, Schema
 
-from imfvla.errors import UserError, unreadable
+from imfvla.errors import UserError
 from imfvla.recording.mcap_file import missing_end, streamed_records
-from imfvla.sources.checks import misfit, missing_extra, shortened
+from imfvla.sources.checks import misfit, missing_extra, read_errors_told, shortened
+from imfvla.storage.opening import ANYWHERE, DATA, open_to_read, real_path, size_of
 
 try:
     from mcap_ros2.decoder import DecoderFactory
@@ -74,6 +75,8 @@ def _bags_at(path: Path) -> list[Bag]:
     if not path.is_dir():
         raise UserError(f"There is no bag {path}: give the path of a .mcap file or of a bag's folder.")
     entries = sorted(path.iterdir(), key=lambda entry: _natural(entry.name))
+    for entry in entries:
+        real_path(entry)
     files = [
         _supported(entry) for entry in entries if entry.is_file() and re.search(r"\.(mcap|db3)\b", entry.name)
     ]
@@ -109,8 +112,8 @@ def received(bag: Bag, topics: Collection[str]) -> Iterator[Received]:
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
         factory = DecoderFactory()
-        with clear_errors(path), path.open("rb") as stream:
-            for record in streamed_records(stream, path.stat().st_size, MAX_BAG_BYTES):
+        with clear_errors(path), open_to_read(path, DATA, home=ANYWHERE) as stream:
+            for record in streamed_records(stream, size_of(stream), MAX_BAG_BYTES):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel):
@@ -130,8 +133,8 @@ def topics_of(bag: Bag) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in bag.files:
         schemas: dict[int, str] = {}
-        with clear_errors(path), path.open("rb") as stream:
-            for record in streamed_records(stream, path.stat().st_size, MAX_BAG_BYTES):
+        with clear_errors(path), open_to_read(path, DATA, home=ANYWHERE) as stream:
+            for record in streamed_records(stream, size_of(stream), MAX_BAG_BYTES):
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
@@ -151,22 +154,18 @@ def _check_channel(channel: Channel, schema: Schema | None, path: Path) -> None:
         )
 
 
-@contextmanager
-def clear_errors(path: Path) -> Iterator[None]:
-    """Turns what damaged bytes raise into a UserError."""
-    try:
-        yield
-    except UserError:
-        raise
-    except FileNotFoundError as error:
-        raise UserError(f"{path} is missing: wanted a bag there; copy the bag again.") from error
-    except PermissionError as error:
-        raise unreadable(path, error) from error
-    except NotImplementedError as error:
-        raise UserError(
-            f"{path} has a message that is not supported: {error}; leave this topic out."
-        ) from error
-    except Exception as error:  # a damaged byte can raise anything
-        cut = missing_end(path)
-        found = f"cut off, without its {cut}" if cut else shortened(f"{type(error).__name__} {error}".strip())
-        raise UserError(f"{path} must be a whole MCAP file of ROS 2, found it {found}; {COPY}.") from error
+def clear_errors(path: Path) -> AbstractContextManager[None]:
+    """Turns what damaged bytes raise, which can be anything, into a UserError."""
+    return read_errors_told(
+        path,
+        "a bag",
+        "copy the bag again",
+        lambda error: f"has a message that is not supported: {error}; leave this topic out.",
+        lambda error: f"must be a whole MCAP file of ROS 2, found it {_damage(path, error)}; {COPY}.",
+        (Exception,),
+    )
+
+
+def _damage(path: Path, error: Exception) -> str:
+    cut = missing_end(path)
+    return f"cut off, without its {cut}" if cut else shortened(f"{type(error).__name__} {error}".strip())

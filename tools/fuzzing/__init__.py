@@ -1,0 +1,1 @@
+"""What `tools/fuzz.py` damages, how, and who reads it."""
