@@ -83,8 +83,7 @@ class HighNoiseTimes:
 def step_times(nfe: int, last_step: float | None = None) -> Tensor:
     """Times (nfe + 1,) from noise, 1, to data, 0: equal steps; with `last_step` the last of several starts there.
 
-    A last step from low noise gives a sharp sample: its network sees a chunk that is nearly decided, and gives the one
-    nearest to it. One from t = 1/2 gives a mean over what is still open there (arXiv 2512.01809 refines from 0.1).
+    Two steps then are one to the mean and one from little noise (arXiv 2512.01809 refines from 0.1).
     """
     if last_step is None:
         return torch.linspace(1, 0, nfe + 1)
