@@ -7,6 +7,8 @@ import sys
 import pytest
 
 from imfvla.config.assets import folder
+from imfvla.reporting.cells import alone
+from imfvla.reporting.metrics import Metric
 
 RUN = folder("experiments") / "pretrained" / "socket_ph32_exec16" / "generator=imf_plain"
 LINE = 'Metric("mean_steps", "steps", plain(np.mean, column("num_steps")), "Steps", 1)'
@@ -50,3 +52,9 @@ def test_a_new_metric_is_a_column_of_committed_results():
         cells = [row[head.index(title)] for row in rows]
         assert cells == [f"{value:.{digits}f}" for value in found["steps"]]
     assert found["json"] == pytest.approx(found["steps"])
+
+
+def test_a_number_that_was_not_measured_is_a_dash():
+    for share in (None, "grasp_share"):
+        metric = Metric("grasps", "grasps", lambda episodes: None, "Grasps", 0, 0, share=share)
+        assert alone(metric, {"grasps": None, "episodes": 4}) == "-"
