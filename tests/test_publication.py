@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -181,3 +182,4 @@ if __name__ == "__main__":
         for path, content in make_tables().items():
             if path.stem in STEMS:
                 write_together({EXPECTED / path.name: content})
+    runpy.run_path(str(EXPECTED.parent / "reporting" / "test_table_row.py"), run_name="__main__")

@@ -14,7 +14,8 @@ from imfvla.figures.style import BLUE, GREEN, GREY, ORANGE, PALE, PURPLE, SKY, V
 WIDTH, HEIGHT = 128, 72
 MAX_SHOWN = 12  # sources of the residual; if there are more, the middle is left out
 STEP_COLORS = (VERMILION, BLUE, GREEN, ORANGE, PURPLE)
-# For each generator: title, what is regressed on what, and remarks that hold for all its options.
+# For each generator: title, what is regressed on what, and remarks that hold for all its options. One that is not
+# listed has its name as title and no equation.
 LEARNS = {
     "ImprovedMeanFlow": (
         "Improved Mean Flow: what is learnt",
@@ -134,7 +135,8 @@ def _curve(sheet: Sheet, x: float, y: float, width: float, height: float) -> Any
 
 
 def _training(sheet: Sheet, method: Method) -> None:
-    unknown = (f"{method.generator}: what is learnt", "", ())
+    name = method.generator[:1].upper() + method.generator[1:]
+    unknown = (f"{name}: what is learnt", "", ())
     title, equation, remarks = LEARNS.get(method.generator_class, unknown)
     sheet.box(2, 2, 61, 36, title=title, face="#fbeaf3")
     if method.prediction:

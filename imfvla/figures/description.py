@@ -1,5 +1,6 @@
 """The method of a composed training config, in the words and numbers of the figures."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ CORE = {
 # of a block, in the order in which they run (the `num_sublayers` of the core's block)
 SUBLAYERS = {"CrossAttentionCore": ("attention", "cross-attention", "MLP")}
 TWO_SUBLAYERS = ("attention", "MLP")
+# A generator that is not listed is shown by the name of its class: "ConsistencyModel" as "consistency model".
 GENERATOR = {
     "ImprovedMeanFlow": "improved Mean Flow",
     "MeanFlow": "Mean Flow",
@@ -131,7 +133,7 @@ def describe(config: Mapping[str, Any]) -> Method:
         block_size=residual.get("block_size", 1),
         readout=residual.get("readout", "sum"),
         generator_class=_class(generator),
-        generator="L2 regression" if generator.get("power") == 2 else _name(generator, GENERATOR),
+        generator="L2 regression" if generator.get("power") == 2 else generator_name(_class(generator)),
         parametrisation=generator.get("parametrisation"),
         times=_name(times, TIMES) if times else None,
         boundary_share=generator.get("boundary_share"),
@@ -148,6 +150,14 @@ def describe(config: Mapping[str, Any]) -> Method:
 def sublayers_of(core: Mapping[str, Any]) -> tuple[str, ...]:
     """What a block of a configured core is made of."""
     return SUBLAYERS.get(_class(core), TWO_SUBLAYERS)
+
+
+def generator_name(cls: str) -> str:
+    """A generator's class in words: those of GENERATOR, else the words that its name is made of."""
+    if cls in GENERATOR:
+        return GENERATOR[cls]
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", cls)
+    return " ".join(word if word.isupper() else word.lower() for word in words) or cls
 
 
 def listing(numbers: Sequence[int]) -> str:

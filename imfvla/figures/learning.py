@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from imfvla.figures.description import GENERATOR
+from imfvla.figures.description import generator_name
 from imfvla.figures.names import training_of
 from imfvla.figures.panels import look, plain_log_ticks, say_nothing_yet, tasks_of
 from imfvla.figures.style import WIDTH, new_figure, style
@@ -109,7 +109,7 @@ def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
         unit = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
         value = kind.get(unit)
         detail = OUTPUTS.get(str(value), f"{unit} {_class(value) if isinstance(value, dict) else value}")
-        name = GENERATOR.get(kind["class"], kind["class"] or "training loss")
+        name = generator_name(kind["class"]) or "training loss"
         titles.append(f"{name}, {detail}" if unit else name)
     return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]
 

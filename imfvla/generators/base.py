@@ -4,9 +4,11 @@ Convention everywhere: t = 0 is data, t = 1 is noise, z_t = (1 - t) x + t e, vel
 Shapes: B batch, H steps, A action.
 """
 
+import hashlib
 from collections.abc import Callable
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -15,14 +17,36 @@ from imfvla.options import above, at_least, within
 
 
 class Generator(Protocol):
-    """One algorithm: how to learn from chunks, how to turn noise into a chunk. Works on normalised actions."""
+    """One algorithm: how to learn from chunks, how to turn noise into a chunk. Works on normalised actions.
 
-    core_interface: str  # how it calls the core: "flow" is core(z, t, r, context); "style" is ACT's
+    With `core_interface = "flow"` the core is called as `core(z, t, r, context)` and gives (B, H, A). z (B, H, A) is
+    the noisy chunk, t (B,) its time and r (B,) where the step from t ends: 0 <= r <= t <= 1. A method without an
+    interval passes r = t, one that goes all the way to data r = 0. "flow and v-head" has `core.instant(z, t, context)`
+    too. "style" is ACT's (`imfvla.nn.act.ActCore`).
+
+    `context` is what the core made of B observations. The generator hands it on, and may call
+    - `context.repeat(N)`: (B * N, ...), the N draws of an observation side by side, as `repeat_interleave` does,
+    - `context.rows(index)`: some of its rows,
+    - `context.detach(dtype)`: without gradient, in the precision of a derivative or of targets.
+
+    Generators of this package have `clip` too: normalised actions are taken to lie within [-clip, clip], and `sample`
+    clamps the chunk to that.
+
+    Optional, where a generator has them: `DrawsNoise`, `HasStages`, and `times`, a `TimeSampler` that the config group
+    `generator/times` chooses.
+    """
+
+    core_interface: str  # how it calls the core: "flow", "flow and v-head" or "style"
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars to log."""
+        """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars without gradient to log.
+
+        `rng` is a generator of the CPU, wherever the actions are: draw first, then move, as in
+        `torch.randn(x.shape, generator=rng).to(x)`. Of several draws (B * N, H, A) those of an observation lie side by
+        side, and the loss is their mean.
+        """
         ...
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
@@ -32,6 +56,33 @@ class Generator(Protocol):
     def check_nfe(self, nfe: int) -> None:
         """Raises UserError where `sample` cannot make do with `nfe` evaluations."""
         ...
+
+
+@runtime_checkable
+class DrawsNoise(Protocol):
+    """Optional part of a generator whose steps draw more noise than they start from, by `ancestral_noise`."""
+
+    def draws_noise(self, nfe: int) -> bool:
+        """Whether `sample` draws noise besides the initial one, which `evaluation.noise_scale` does not reach."""
+        ...
+
+
+@runtime_checkable
+class HasStages(Protocol):
+    """Optional part of a generator whose training has stages; `imfvla.generators.staged` has two."""
+
+    def span(self, name: str, steps: int) -> tuple[float, float]:
+        """The steps [first, end) of `steps` in which the parameter `name` of a policy learns."""
+        ...
+
+    def begin_step(self, core: nn.Module, step: int, steps: int) -> None:
+        """Is told of step `step` (0-based) of `steps` before its loss, and with which step loaded weights end."""
+        ...
+
+
+def draws_noise(generator: Generator, nfe: int) -> bool:
+    """`DrawsNoise.draws_noise`, false for a generator without it."""
+    return isinstance(generator, DrawsNoise) and generator.draws_noise(nfe)
 
 
 LAST_STEP = within(0.01, 0.99)  # a time between noise and data
@@ -88,6 +139,20 @@ def step_times(nfe: int, last_step: float | None = None) -> Tensor:
     if last_step is None:
         return torch.linspace(1, 0, nfe + 1)
     return torch.cat((torch.linspace(1, last_step, nfe), torch.zeros(1)))
+
+
+def ancestral_noise(noise: Tensor, count: int) -> Tensor:
+    """Noise (count, B, H, A) of the later steps, a pure function of the initial noise (B, H, A).
+
+    Each row has its own generator, seeded with the BLAKE2b digest (8 bytes) of the row's float32 bytes, so that a chunk
+    does not depend on the batch that it is sampled in.
+    """
+    rows = []
+    for row in noise.detach().to("cpu", torch.float32):
+        digest = hashlib.blake2b(np.ascontiguousarray(row.numpy()).tobytes(), digest_size=8).digest()
+        rng = torch.Generator().manual_seed(int.from_bytes(digest, "little"))
+        rows.append(torch.randn(count, *row.shape, generator=rng))
+    return torch.stack(rows, dim=1).to(noise)
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:

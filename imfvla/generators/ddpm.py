@@ -11,16 +11,14 @@ depend on its noise (docs/results.md, "Samples and averages").
 Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 """
 
-import hashlib
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.generators.base import LAST_STEP, masked_error, refuse_nfe, step_times
+from imfvla.generators.base import LAST_STEP, ancestral_noise, masked_error, refuse_nfe, step_times
 from imfvla.options import above
 
 MAX_BETA = 0.999
@@ -38,20 +36,6 @@ def trailing_levels(num_levels: int, nfe: int, last_step: float | None = None) -
     if last_step is None:
         return [round(num_levels * (nfe - i) / nfe) - 1 for i in range(nfe)]
     return [max(round(num_levels * t) - 1, 0) for t in step_times(nfe, last_step).tolist()[:-1]]
-
-
-def ancestral_noise(noise: Tensor, count: int) -> Tensor:
-    """Noise (count, B, H, A) of the later steps, a pure function of the initial noise (B, H, A).
-
-    Each row has its own generator, seeded with the BLAKE2b digest (8 bytes) of the row's float32 bytes, so that a chunk
-    does not depend on the batch that it is sampled in.
-    """
-    rows = []
-    for row in noise.detach().to("cpu", torch.float32):
-        digest = hashlib.blake2b(np.ascontiguousarray(row.numpy()).tobytes(), digest_size=8).digest()
-        rng = torch.Generator().manual_seed(int.from_bytes(digest, "little"))
-        rows.append(torch.randn(count, *row.shape, generator=rng))
-    return torch.stack(rows, dim=1).to(noise)
 
 
 class DenoisingDiffusion:
@@ -86,7 +70,7 @@ class DenoisingDiffusion:
         self.prediction = prediction
         self.clip_sample, self.clip = clip_sample, clip
         self.draws, self.last_step = draws, last_step
-        self.num_levels = self.ancestral_nfe = num_levels  # where each step draws noise of its own
+        self.num_levels = num_levels
         self.kept = squared_cosine(num_levels).tolist()
 
     def loss(
@@ -123,10 +107,14 @@ class DenoisingDiffusion:
         if not 1 <= nfe <= self.num_levels:
             raise refuse_nfe(f"between 1 and generator.num_levels={self.num_levels}", nfe)
 
+    def draws_noise(self, nfe: int) -> bool:
+        """Each ancestral step draws noise of its own; DDIM draws none."""
+        return nfe == self.num_levels
+
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
         """A chunk (B, H, A): ancestral where `nfe` is the number of levels, else DDIM."""
         self.check_nfe(nfe)
-        walk = self.ancestral if nfe == self.num_levels else self.ddim
+        walk = self.ancestral if self.draws_noise(nfe) else self.ddim
         return walk(core, context, noise, nfe).clamp(-self.clip, self.clip)
 
     def ddim(self, core: nn.Module, context: Any, z: Tensor, nfe: int) -> Tensor:

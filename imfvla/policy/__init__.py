@@ -15,7 +15,7 @@ from imfvla.config.protocol import USUAL_NOISE
 from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
-from imfvla.generators.base import Generator
+from imfvla.generators.base import Generator, HasStages, draws_noise
 from imfvla.policy.budget import SizeBudget
 from imfvla.policy.chunks import ChunkFrame
 from imfvla.robot import RobotSpec
@@ -55,8 +55,8 @@ class Policy(nn.Module):
 
     @property
     def has_stages(self) -> bool:
-        """Whether what is learned depends on the step: the generator has `span` and `begin_step`."""
-        return hasattr(self.generator, "begin_step")
+        """Whether what is learned depends on the step."""
+        return isinstance(self.generator, HasStages)
 
     def spans(self, steps: int) -> dict[str, tuple[float, float]]:
         """Of parameters that do not learn in all of `steps` steps, the steps [first, end) in which they do, by name."""
@@ -83,10 +83,11 @@ class Policy(nn.Module):
     def check_sampling(self, nfe: int, noise_scale: float) -> None:
         """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale."""
         self.generator.check_nfe(nfe)
-        if noise_scale != USUAL_NOISE and nfe == getattr(self.generator, "ancestral_nfe", None):
+        if noise_scale != USUAL_NOISE and draws_noise(self.generator, nfe):
             raise UserError(
-                f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: ancestral sampling draws "
-                "noise of its own in every step, which the scale does not reach. Take fewer evaluations (DDIM)."
+                f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: with so many evaluations "
+                f"{type(self.generator).__name__} draws noise in later steps too, which the scale does not reach. Take "
+                "noise_scale=1 or another nfe."
             )
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:

@@ -18,7 +18,7 @@ def with_its_interval(metric: Metric, result: Result) -> str:
     if result.is_missing:
         return MISSING
     measured = result.metrics[metric.name]
-    if metric.share is not None:
+    if metric.share is not None and measured.value is not None:
         share = result.metrics[metric.share].scaled(100)
         return f"{measured.value}/{len(result.episodes)} {interval(share, 1, '%')}"
     if metric.estimate is None:
@@ -27,9 +27,10 @@ def with_its_interval(metric: Metric, result: Result) -> str:
 
 
 def alone(metric: Metric, summary: Mapping[str, Any]) -> str:
-    """Of a summary.json, which may be older than the metric."""
+    """Of a summary with the numbers of its episodes."""
     value = summary.get(metric.name)
-    return number(value, metric.digits) if metric.share is None else f"{value}/{summary['episodes']}"
+    is_count = metric.share is not None and value is not None
+    return f"{value}/{summary['episodes']}" if is_count else number(value, metric.digits)
 
 
 def printed(metric: Metric, paper: PaperRow) -> str:

@@ -18,12 +18,6 @@ from imfvla.storage.run_names import run_key
 from imfvla.storage.trained_config import DIGEST, refuse_changed_config, refuse_other_config
 
 REMEDY = "evaluate again with overwrite=true"
-# Of a summary, in the order of `table_row.json`.
-METRICS = (
-    "episodes", "avg_return", "median_return", "mean_max_reward", "max_return", "nonzero_episodes",
-    "success_episodes", "inference_fps", "control_fps", "inference_ms_mean", "inference_ms_median",
-    "inference_ms_p95", "success_interval", "failures",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

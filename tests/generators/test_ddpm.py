@@ -10,7 +10,8 @@ from torch import nn
 
 from imfvla.errors import UserError
 from imfvla.generators import ddpm
-from imfvla.generators.ddpm import DenoisingDiffusion, ancestral_noise, squared_cosine, trailing_levels
+from imfvla.generators.base import ancestral_noise
+from imfvla.generators.ddpm import DenoisingDiffusion, squared_cosine, trailing_levels
 
 LEVELS = 100
 PREDICTIONS = ["epsilon", "sample", "v"]

@@ -3,21 +3,25 @@
 import json
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 import yaml
 from rich.console import Console
 
+from imfvla.episode import EpisodeResult
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.metrics import summarise
 from imfvla.reporting.recomputed import digest_of
+from imfvla.reporting.rows import row_of
 from imfvla.reporting.runs import rows
 from imfvla.reporting.table_row import print_row
 from imfvla.storage.run_directory import RunDirectory
 
-EXPECTED = Path(__file__).with_name("table_row.md").read_text()
+EXPECTED_FILE = Path(__file__).with_name("table_row.md")
+EXPECTED = EXPECTED_FILE.read_text()
 
 
 def write_evaluation(
@@ -31,12 +35,14 @@ def write_evaluation(
     failure: str | None = None,
 ) -> Path:
     episodes = [
-        {
-            "seed": first_seed + index, "start_digest": f"{index:016x}", "num_steps": 700,
-            "total_reward": gain * (1200.0 + 200 * index), "max_reward": 3.0 + 2 * (index % 2),
-            "success": index % 2 == 1, "first_step_of_stage": [], "failure": failure,
-            "timing": {"wall_s": 2.0, "inference_ms": [4.0, 8.0]},
-        }
+        row_of(
+            EpisodeResult(
+                seed=first_seed + index, start_digest=f"{index:016x}", num_steps=700,
+                total_reward=gain * (1200.0 + 200 * index), max_reward=3.0 + 2 * (index % 2),
+                success=index % 2 == 1, first_step_of_stage=(), failure=failure,
+                inference_ms=(4.0, 8.0), wall_s=2.0,
+            )
+        )
         for index in range(4)
     ]  # fmt: skip
     summary = summarise(episodes) | {
@@ -58,14 +64,18 @@ def make_run(path: Path, name: str = "socket_ph32_exec16") -> Path:
     return path
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
+def make_evaluated(runs: Path) -> Path:
     """A run with an evaluation that the paper has (nfe 1) and one that it has not (nfe 4)."""
     (name,) = (row.run for row in read_mapping().rows if row.name == "socket_infer1")
-    path = make_run(tmp_path / "runs" / "socket_ph32_exec16" / name)
+    path = make_run(runs / "socket_ph32_exec16" / name)
     for nfe in (4, 1):
         write_evaluation(path, nfe)
     return path
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return make_evaluated(tmp_path / "runs")
 
 
 def test_the_row_as_markdown_json_and_text(run):
@@ -156,3 +166,10 @@ def test_a_run_without_its_rows_is_refused(run):
     (write_evaluation(run, 1) / "episodes.jsonl").unlink()
     with pytest.raises(UserError, match=r"episodes\.jsonl is missing beside its summary\.json"):
         print_row(RunDirectory(run), Console(quiet=True))
+
+
+if __name__ == "__main__":  # rewrites the expected file, to review what has changed
+    with tempfile.TemporaryDirectory() as directory:
+        evaluated = make_evaluated(Path(directory))
+        print_row(RunDirectory(evaluated), Console(quiet=True))
+        EXPECTED_FILE.write_bytes((evaluated / "table_row.md").read_bytes())
