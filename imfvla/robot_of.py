@@ -1,6 +1,6 @@
 """Which robot a config is about: stated by the task, our own two arms, or what environment or data says."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from typing import Any
 
@@ -27,11 +27,9 @@ def robot_of(config: Mapping[str, Any]) -> RobotSpec:
 
 
 def place_of_robot(config: Mapping[str, Any]) -> str:
-    """The key that states the robot of a config, such as "task.robot", or the task that brings it."""
-    for where, group in _statements(config):
-        if group.get(KEY) is not None:
-            return where
-    return f"task={part_of(config, 'task.name')}"
+    """Where a user finds the robot of a config: "task.robot" where that is stated, else the task that brings it."""
+    task = part_of(config, "task")
+    return f"task.{KEY}" if task.get(KEY) is not None else f"task={task['name']}"
 
 
 def with_robot(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -45,14 +43,8 @@ def has_environment(config: Mapping[str, Any]) -> bool:
     return not isinstance(task, Mapping) or task.get("name") != NO_ENVIRONMENT
 
 
-def _statements(config: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Keys that may state the robot, with the mapping that each is in; the first one counts."""
-    yield KEY, config
-    yield f"task.{KEY}", config.get("task", {})
-
-
 def _robot(config: Mapping[str, Any], views: ViewOptions) -> RobotSpec:
-    for where, group in _statements(config):
+    for where, group in ((KEY, config), (f"task.{KEY}", config.get("task", {}))):
         if group.get(KEY) is not None:
             return RobotSpec.from_json(group[KEY], where)
     # Imported here: a robot that is stated needs neither tasks nor data.
