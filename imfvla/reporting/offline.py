@@ -57,8 +57,11 @@ def read_offline(run: RunDirectory) -> Offline | None:
         list(found["error"]),
     )
     for name, rows in found["error"].items():
-        fits = len(rows) >= found["executed"] and all(len(row) == number for row in rows)
-        require(fits, f"{where} of {name}", f"a number for each step and each of {number} channels", rows)
+        if len(rows) < found["executed"] or any(len(row) != number for row in rows):
+            raise UserError(
+                f"{where} of {name} must be a number for each step and each of {number} channels, found "
+                f"{len(rows)} rows of {len(rows[0])}; {REMEDY}."
+            )
     require(len(found["deviation"]) == number, f"{path}: deviation", f"{number} numbers", found["deviation"])
     return found
 

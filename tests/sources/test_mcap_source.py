@@ -65,6 +65,6 @@ def test_a_folder_without_recordings_is_named(tmp_path):
 
 def test_paraphrases_that_are_no_texts_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("synthetic.PARAPHRASES", {"not": "a list"})
-    source = McapSource.of(write_demonstrations(tmp_path / "demos", num_episodes=1))
+    folder = write_demonstrations(tmp_path / "demos", num_episodes=1)
     with pytest.raises(UserError, match="paraphrases must be a list"):
-        source.episode(0)
+        McapSource.of(folder)

@@ -37,7 +37,7 @@ def test_only_what_is_named_is_trained_on(synthetic_demonstrations):
 
 def test_a_place_that_takes_no_store_is_named_with_the_key(synthetic_demonstrations, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"frame store .*Not a directory; choose .*demos\.frames_directory"):
+    with pytest.raises(UserError, match=r"frame store .*; choose .*demos\.frames_directory"):
         windows(McapSource.of(synthetic_demonstrations), f"demos.frames_directory={tmp_path}/file/frames")
 
 
