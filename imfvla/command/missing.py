@@ -48,6 +48,6 @@ def _file_of(group: Any) -> Path | None:
 
 def _notes(path: Path) -> dict[str, str]:
     """Key -> the comment beside it."""
-    lines: Iterable[str] = path.read_text().splitlines()
+    lines: Iterable[str] = path.read_text(encoding="utf-8").splitlines()
     found = [match for line in lines if (match := LINE.fullmatch(line))]
     return {match[1]: match[2] for match in found if match[2]}
