@@ -26,6 +26,12 @@ def robot_of(config: Mapping[str, Any]) -> RobotSpec:
     return robot
 
 
+def place_of_robot(config: Mapping[str, Any]) -> str:
+    """Where a user finds the robot of a config: "task.robot" where that is stated, else the task that brings it."""
+    task = part_of(config, "task")
+    return f"task.{KEY}" if task.get(KEY) is not None else f"task={task['name']}"
+
+
 def with_robot(config: Mapping[str, Any]) -> dict[str, Any]:
     """The config with its robot resolved, as it goes into a run directory."""
     return {**config, KEY: robot_of(config).to_json()}

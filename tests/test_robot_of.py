@@ -126,7 +126,8 @@ def test_an_environment_of_another_robot_is_refused_before_a_step():
 def test_data_of_another_robot_is_refused():
     source = MemorySource(replace(robot_of_size(16, 16), cameras=ARMS.cameras))
     with pytest.raises(
-        UserError, match=r"demos\.source=scripted has another robot .* state channel 0 must be left"
+        UserError,
+        match=r"state channel 0 is left\S* .* in task=socket, but part_0\S* .* in .* demos\.source=scripted",
     ):
         refuse_other_source(compose("train"), source)
 

@@ -26,6 +26,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from imfvla.command.missing import refuse_missing
 from imfvla.config.assets import folder, install_command
 from imfvla.errors import UserError
 from imfvla.options import require, suggestion
@@ -81,7 +82,8 @@ def choices_of(group: str, config_name: str, places: Places = NOWHERE_ELSE) -> l
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
-    """A resolved copy without OmegaConf types. Raises OmegaConf's errors for missing values."""
+    """A resolved copy without OmegaConf types. Raises UserError naming all mandatory values that are missing."""
+    refuse_missing(config)
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     return plain

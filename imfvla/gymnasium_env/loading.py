@@ -9,11 +9,12 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.gymnasium_env.environment import GymnasiumEnvironment
 from imfvla.gymnasium_env.options import RENDER, GymnasiumTask, read_task
-from imfvla.gymnasium_env.packages import cameras_of, import_gymnasium, register
+from imfvla.gymnasium_env.packages import GYMNASIUM, cameras_of, import_gymnasium, register, registered_by
 from imfvla.process.gl import select_before_simulators
 
 SLACK = 1e-4  # of limits that are written with a few digits
 TRIED_SEED = 0
+MAX_NAMED = 20  # environments in a message
 
 
 def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEnvironment:
@@ -25,7 +26,7 @@ def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEn
     wanted = read_task(task, observation)
     gymnasium = import_gymnasium()
     select_before_simulators()
-    register(wanted.package)
+    register(wanted.package, wanted.id)
     draws = RENDER in (wanted.pictures[view] for view in wanted.views)
     mode = {"render_mode": "rgb_array"} if draws else {}
     try:
@@ -37,9 +38,7 @@ def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEn
             **wanted.kwargs,
         )
     except gymnasium.error.Error as error:
-        raise UserError(
-            f"task.id={wanted.id} cannot be made ({error}): correct it, or name in task.package what registers it."
-        ) from error
+        raise UserError(f"task.id={wanted.id} cannot be made ({error}): {_remedy(wanted)}.") from error
     except (TypeError, ValueError, NotImplementedError) as error:
         raise UserError(
             f"task.kwargs={wanted.kwargs} do not fit {wanted.id} ({error}): correct them."
@@ -52,6 +51,20 @@ def load(task: Mapping[str, Any], observation: Mapping[str, Any]) -> GymnasiumEn
         _try(loaded)
         refused.pop_all()  # it is not
     return loaded
+
+
+def _remedy(task: GymnasiumTask) -> str:
+    """What to do where the environment cannot be made, whatever registered it."""
+    if task.package is None:
+        return "correct it, or name in task.package what registers it"
+    if task.id in import_gymnasium().registry:
+        return "correct it"
+    found = registered_by(task.package)
+    return (
+        f"task.package={task.package} is imported, but registers nothing under that id (it registers "
+        f"{', '.join(found[:MAX_NAMED]) or 'nothing'}); correct task.id, or let the package register it when it is "
+        f"imported or in a function that an entry point of {GYMNASIUM} names"
+    )
 
 
 def _check_actions(space: Any, task: GymnasiumTask) -> None:

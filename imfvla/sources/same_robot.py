@@ -14,28 +14,25 @@ def refuse_other_robot(
     Compared are channels, displacements, limits, rate and the cameras of `views`: their sizes may differ, since
     pictures are resampled, but not their proportions.
     """
-    _refuse(_differences(wanted, found, views, with_frame=True), of, where, remedy)
+    for what, one, other in _differences(wanted, found, views, with_frame=True):
+        raise UserError(f"{where} has another robot than {of}: {what} must be {one}, found {other}. {remedy}")
 
 
 def refuse_other_data(
     wanted: RobotSpec, found: RobotSpec, views: Iterable[str], *, of: str, where: str, remedy: str
 ) -> None:
-    """The same for data to learn from.
+    """The same for data to learn from, where either side may be the wrong one: `of` a task and `where` say both values.
 
     Neither limits nor displacements are compared: data sets rarely state them, and a policy takes its own.
     """
-    _refuse(_differences(wanted, found, views, with_frame=False), of, where, remedy)
-
-
-def _refuse(differences: Iterator[str], of: str, where: str, remedy: str) -> None:
-    first = next(differences, None)
-    if first is not None:
-        raise UserError(f"{where} has another robot than {of}: {first}. {remedy}")
+    for what, one, other in _differences(wanted, found, views, with_frame=False):
+        raise UserError(f"Different robots: {what} is {one} in {of}, but {other} in {where}. {remedy}")
 
 
 def _differences(
     wanted: RobotSpec, found: RobotSpec, views: Iterable[str], *, with_frame: bool
-) -> Iterator[str]:
+) -> Iterator[tuple[str, str, str]]:
+    """What differs, as it is in `wanted`, as it is in `found`."""
     for key in ("state", "action"):
         yield from _channels(key, getattr(wanted, key), getattr(found, key))
     if with_frame:
@@ -44,33 +41,34 @@ def _differences(
                 wanted.action, getattr(wanted, key), getattr(found, key), strict=True
             ):
                 if one != other:
-                    yield f"{key} of {name} must be {_shown(one)}, found {_shown(other)}"
+                    yield f"{key} of {name}", _shown(one), _shown(other)
     if wanted.control_hz != found.control_hz:
-        yield f"control_hz must be {wanted.control_hz:g}, found {found.control_hz:g}"
+        yield "control_hz", f"{wanted.control_hz:g}", f"{found.control_hz:g}"
     cameras = {camera.name: camera for camera in found.cameras}
     for view in views:
         camera = wanted.camera(view)
         if view not in cameras:
-            yield f"there must be a camera {view}, found {', '.join(cameras) or 'none'}"
+            yield f"camera {view}", "there", f"not among its cameras ({', '.join(cameras) or 'none'})"
         elif not _is_alike(camera, cameras[view]):
-            yield (
-                f"camera {view} must have the proportions of {camera.height} x {camera.width} pixels, found "
-                f"{cameras[view].height} x {cameras[view].width}"
-            )
+            yield f"the proportions of camera {view}", _size(camera), _size(cameras[view])
 
 
-def _channels(key: str, wanted: tuple[str, ...], found: tuple[str, ...]) -> Iterator[str]:
+def _channels(key: str, wanted: tuple[str, ...], found: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
     """Names must agree, and units where both state one: data sets often have none."""
     for number, (one, other) in enumerate(zip(wanted, found, strict=False)):
         units = unit_of(one), unit_of(other)
         if bare_name(one) != bare_name(other) or (all(units) and units[0] != units[1]):
-            yield f"{key} channel {number} must be {one}, found {other}"
+            yield f"{key} channel {number}", one, other
     if len(wanted) != len(found):
-        yield f"{key} must have {len(wanted)} channels, found {len(found)}"
+        yield f"the number of {key} channels", f"{len(wanted)}", f"{len(found)}"
 
 
 def _is_alike(one: Camera, other: Camera) -> bool:
     return one.height * other.width == other.height * one.width
+
+
+def _size(camera: Camera) -> str:
+    return f"{camera.height} x {camera.width} pixels"
 
 
 def _shown(value: float | None) -> str:

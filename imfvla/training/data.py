@@ -10,7 +10,7 @@ from imfvla.data import FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
 from imfvla.options import build
 from imfvla.process.progress import Progress
-from imfvla.robot_of import robot_of
+from imfvla.robot_of import place_of_robot, robot_of
 from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.opening import source_kind
@@ -55,9 +55,9 @@ def refuse_other_source(config: Mapping[str, Any], source: EpisodeSource) -> Non
         robot_of(config),
         source.robot,
         view_options(config).views,
-        of="the task",
-        where=f"The data of demos.source={source_kind(config)}",
-        remedy="Choose data or a task of the same robot.",
+        of=place_of_robot(config),
+        where=f"the data of demos.source={source_kind(config)}",
+        remedy="Correct the one that is wrong, or choose data and a task of the same robot.",
     )
 
 

@@ -30,6 +30,27 @@ def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message)
     assert "\n" not in str(caught.value)
 
 
+def test_all_missing_values_are_named_at_once_with_what_they_may_be():
+    with pytest.raises(UserError, match=r"^Missing values of demos\.action .*, demos\.control_hz ") as caught:
+        compose("train", ["task=none", "demos=hdf5", "demos.instruction=go", "name=x"])
+    text = str(caught.value)
+    for part in (
+        "demos.layout (robomimic or act)",
+        "demos.path (a file",
+        "demos.state",
+        "conf/demos/hdf5.yaml",
+    ):
+        assert part in text
+    assert "demos.instruction" not in text
+
+
+def test_one_missing_value_is_named():
+    with pytest.raises(
+        UserError, match=r"^Missing value of demos\.path .*demos\.path=\.\.\.; see conf/demos/lerobot"
+    ):
+        compose("train", ["task=none", "demos=lerobot", "name=x"])
+
+
 def test_gives_plain_values():
     config = compose("train", ["horizon.pred=8", "horizon.exec=4"])
     assert type(config) is type(config["horizon"]) is dict

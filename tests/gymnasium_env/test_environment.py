@@ -10,7 +10,7 @@ pytest.importorskip("gymnasium", reason="the extra gym is not installed")
 from worlds import ID, OBSERVATION, Slider, config
 
 from imfvla.errors import UserError
-from imfvla.gymnasium_env import load, packages
+from imfvla.gymnasium_env import load
 from imfvla.gymnasium_env.options import read_task
 
 
@@ -123,18 +123,6 @@ def test_a_refused_environment_is_closed(changes, monkeypatch):
     with pytest.raises(UserError):
         load(config(**changes), OBSERVATION)
     assert len(closed) == 1
-
-
-def test_only_registered_packages_are_imported(monkeypatch):
-    monkeypatch.delitem(sys.modules, "this", raising=False)
-    with pytest.raises(UserError, match="nothing else is imported"):
-        packages.register("this")
-    assert "this" not in sys.modules
-    point = packages.metadata.EntryPoint("worlds", "this.part:Thing", "imfvla.components")
-    monkeypatch.setattr(
-        packages.metadata, "entry_points", lambda group: [point] if group == "imfvla.components" else []
-    )
-    assert "this" in packages.allowed_packages()
 
 
 def test_a_missing_extra_is_named(monkeypatch):

@@ -36,7 +36,7 @@ def test_recordings_of_different_robots_are_not_mixed(synthetic_demonstrations):
     source = McapSource.of(synthetic_demonstrations)
     with pytest.raises(
         UserError,
-        match=r"episode-00002\.mcap has another robot .*00000\.mcap: camera top must have .* 32 x 40\. Keep",
+        match=r"episode-00002\.mcap has another robot .*00000\.mcap: .*camera top must be .* 32 x 40 pixels\. Keep",
     ):
         source.episode(2, ("top",))
 

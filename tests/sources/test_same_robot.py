@@ -30,7 +30,7 @@ def test_a_robot_is_itself():
             {"state": (*ROBOT.state[:-1], "part_8/position [deg]")},
             r"state channel 8 must be .* \[rad\], found .* \[deg\]",
         ),
-        ({"state": (*ROBOT.state, "more [m]")}, "state must have 9 channels, found 10"),
+        ({"state": (*ROBOT.state, "more [m]")}, "the number of state channels must be 9, found 10"),
         ({"action": ("other [rad]", *ROBOT.action[1:])}, "action channel 0 must be .*target"),
         (
             {"relative_to": (None, *ROBOT.relative_to[1:])},
@@ -38,10 +38,13 @@ def test_a_robot_is_itself():
         ),
         ({"action_max": (9.0, *ROBOT.action_max[1:])}, "action_max of part_0/target .* must be 4, found 9"),
         ({"control_hz": 30.0}, "control_hz must be 10, found 30"),
-        ({"cameras": ROBOT.cameras[:1]}, "there must be a camera camera_1, found camera_0"),
+        (
+            {"cameras": ROBOT.cameras[:1]},
+            r"camera camera_1 must be there, found not among its cameras \(camera_0\)",
+        ),
         (
             {"cameras": (ROBOT.cameras[0], Camera("camera_1", 16, 20))},
-            "camera_1 must have the proportions of 16 x 16 pixels, found 16 x 20",
+            "the proportions of camera camera_1 must be 16 x 16 pixels, found 16 x 20",
         ),
     ],
 )
@@ -70,3 +73,12 @@ def test_data_need_state_neither_units_nor_limits_nor_displacements():
     refuse_other_data(ROBOT, without, VIEWS, **WORDS)
     with pytest.raises(UserError, match="relative_to of part_0/target"):
         refuse_other_robot(ROBOT, without, VIEWS, **WORDS)
+
+
+def test_of_data_both_values_and_both_places_are_said_since_either_may_be_wrong():
+    words = {"of": "task.robot", "where": "the data", "remedy": "Correct one."}
+    with pytest.raises(
+        UserError,
+        match=r"^Different robots: control_hz is 10 in task\.robot, but 30 in the data\. Correct one",
+    ):
+        refuse_other_data(ROBOT, replace(ROBOT, control_hz=30.0), VIEWS, **words)
