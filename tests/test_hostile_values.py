@@ -204,6 +204,9 @@ DETAILS = {
         ("gradient_scale", -1.0, "gradient_scale must be null or between 0"),
         ("batches", [], "batches must be a mapping"),
         ("logger", ..., "details lacks logger"),
+        ("code", 5, "code must be a mapping"),
+        ("earlier_code", [{"until_step": 1, "code": "x"}], "code must be a mapping"),
+        ("config", [], "config must be null or a mapping"),
     ],
 )
 def test_a_state_is_what_it_should_be(tmp_path, key, value, message):

@@ -38,7 +38,7 @@ from imfvla.storage.files import (
     write_json,
 )
 from imfvla.storage.opening import WEIGHTS, Kind, checked
-from imfvla.storage.records import Duration, Step, as_record
+from imfvla.storage.records import Code, Duration, Step, as_record
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.trained_config import refuse_changed_config
 from imfvla.training.precision import PRECISIONS
@@ -58,6 +58,13 @@ class LoggerState(TypedDict):
     skipped: NotRequired[Step]
 
 
+class EarlierCode(TypedDict):
+    """Code that a training ran with before the present one."""
+
+    until_step: Step
+    code: Code
+
+
 class Details(TypedDict):
     """What the loop resumes from besides the tensors."""
 
@@ -68,6 +75,9 @@ class Details(TypedDict):
     gradient_scale: Annotated[float, within(0, 1e300)] | None
     batches: Mapping[str, Plain]  # checked by those who load it
     logger: LoggerState
+    code: NotRequired[Code]
+    earlier_code: NotRequired[Annotated[list[EarlierCode], at_most(1000)]]
+    config: NotRequired[Mapping[str, Plain] | None]
 
 
 @dataclass(frozen=True, slots=True)
