@@ -5,10 +5,9 @@ from itertools import groupby
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from imfvla.figures.names import policy_of
-from imfvla.figures.panels import look, say_nothing_yet, tasks_of
+from imfvla.figures.panels import look, nfe_ticks, say_nothing_yet, tasks_of
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.results import Result
@@ -66,7 +65,6 @@ def _task(axes: Sequence[Axes], methods: dict[str, list[Line]], changes: Sequenc
 
 def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
     axes.set_xlabel("network calls for a chunk (NFE)")
-    axes.set_xscale("log")
     for number, line in enumerate(lines):
         shares = [result.metrics["success_share"].scaled(100) for result in line]
         shift = 1.1 ** (number - (len(lines) - 1) / 2)  # so that intervals do not hide each other
@@ -74,10 +72,8 @@ def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
         change = _policy(line)[1]
         axes.errorbar(x, y, yerr=errors(shares), capsize=2, label=change, markersize=4.5, linewidth=1.2,
                       **look(changes.index(change)))  # fmt: skip
-    ticks = sorted({result.nfe for line in lines for result in line})
+    ticks = nfe_ticks(axes, (result.nfe for line in lines for result in line))
     axes.set_xlim(0.75 * ticks[0], 1.35 * ticks[-1])
-    axes.set_xticks(ticks, [str(tick) for tick in ticks])
-    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _policy(line: Line) -> tuple[str, str]:

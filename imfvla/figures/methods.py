@@ -5,9 +5,8 @@ from itertools import groupby
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
-from imfvla.figures.panels import look, plain_log_ticks, say_nothing_yet
+from imfvla.figures.panels import look, nfe_ticks, plain_log_ticks, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.curves import learning_curve
@@ -37,10 +36,7 @@ def success_by_cost(results: Sequence[Result]) -> Figure:
             shift = 1.06 ** (number - (len(order) - 1) / 2)  # so that intervals do not hide each other
             _draw(left, line, [shift * r.nfe for r in line], number, method)
             _draw(right, line, [r.metrics["inference_ms_mean"].value for r in line], number, method)
-        ticks = sorted({r.nfe for r in measured})
-        left.set_xscale("log")
-        left.set_xticks(ticks, [str(tick) for tick in ticks])
-        left.xaxis.set_minor_locator(NullLocator())
+        nfe_ticks(left, (r.nfe for r in measured))
         right.set_xscale("log")
         plain_log_ticks(right.xaxis)
         left.set_ylim(-3, 103)

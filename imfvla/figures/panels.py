@@ -1,10 +1,10 @@
 """Panels that several figures share: one for each task, legends, axes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from imfvla.figures.style import CYCLE, GREY, MARKERS
 from imfvla.reporting.mapping import read_mapping
@@ -48,6 +48,15 @@ def plain_log_ticks(axis: Axis, digits: Sequence[int] = (1, 2, 5)) -> None:
     axis.set_major_locator(LogLocator(subs=digits))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def nfe_ticks(axes: Axes, nfes: Iterable[int]) -> list[int]:
+    """A log axis of network calls with a tick at each number that occurs; returns these, ascending."""
+    ticks = sorted(set(nfes))
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
+    return ticks
 
 
 def look(number: int) -> dict[str, str]:
