@@ -90,18 +90,7 @@ def test_workers_change_nothing(run):
 def test_a_killed_evaluation_resumes_where_it_stopped(run, monkeypatch):
     roll(run)
     uninterrupted = untimed_lines(run.rollouts(NAME))
-    played: list[int] = []
-    original = workbench.run_episode
-
-    def killed_at_fourth(env, actor, seed, *args, **options):
-        played.append(seed)
-        if len(played) == 4:
-            raise KeyboardInterrupt
-        return original(env, actor, seed, *args, **options)
-
-    monkeypatch.setattr(workbench, "run_episode", killed_at_fourth)
-    with pytest.raises(KeyboardInterrupt):
-        roll(run, overwrite=True)
+    played = left_over(run, monkeypatch, rows=3, overwrite=True)
     partial = run.rollouts(NAME) / PARTIAL
     with open(partial, "a") as file:
         file.write('{"seed": 100003, "sta')  # the line that the kill cut off
@@ -280,20 +269,20 @@ def test_the_episode_of_a_worker_that_died_is_played_again_and_counted(run):
     assert (undisturbed["worker_incidents"], summary["worker_incidents"]) == (0, 1)
 
 
-def left_over(run: RunDirectory, monkeypatch) -> list[int]:
-    """The seeds that are played from now on, with two rows of an interrupted evaluation left."""
+def left_over(run: RunDirectory, monkeypatch, rows: int = 2, **options) -> list[int]:
+    """The seeds that are played from now on, with so many rows of an interrupted evaluation left."""
     played: list[int] = []
     original = workbench.run_episode
 
-    def killed_at_third(env, actor, seed, *args, **options):
+    def killed_after_rows(env, actor, seed, *args, **more):
         played.append(seed)
-        if len(played) == 3:
+        if len(played) == rows + 1:
             raise KeyboardInterrupt
-        return original(env, actor, seed, *args, **options)
+        return original(env, actor, seed, *args, **more)
 
-    monkeypatch.setattr(workbench, "run_episode", killed_at_third)
+    monkeypatch.setattr(workbench, "run_episode", killed_after_rows)
     with pytest.raises(KeyboardInterrupt):
-        roll(run)
+        roll(run, **options)
     return played
 
 
