@@ -1,7 +1,7 @@
 """Checksums of the files of a frame store, in blocks, so that a changed byte is found and its place is named.
 
 CRC-32 finds every accidental change but one in 4 billion, and is the fastest checksum of the standard library. It is
-no protection against somebody who computes it anew.
+no protection against somebody who computes a new one.
 """
 
 import hashlib

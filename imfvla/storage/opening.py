@@ -33,7 +33,7 @@ RECORDING = Kind("recording", 2 * 2**30)
 VIDEO = Kind("video", 2 * 2**30)
 WEIGHTS = Kind(
     "file of weights", 32 * 2**30
-)  # of weights to begin with; a policy says exactly how many it needs
+)  # pretrained ones; a policy says exactly how many bytes it needs
 DATA = Kind("file of a data set", 256 * 2**30)  # read in parts
 ARRAY = Kind("array", math.inf)  # mapped, not read
 OF_SUFFIX = {

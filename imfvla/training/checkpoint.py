@@ -51,7 +51,7 @@ MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # what AdamW keeps of a parameter
 
 
 class LoggerState(TypedDict):
-    """The interval that has begun: sums of scalars over so many steps."""
+    """What the logger has added up since its last line: sums of scalars, and of how many steps."""
 
     sums: Annotated[Mapping[str, Number], at_most(1000)]
     count: NotRequired[Step]

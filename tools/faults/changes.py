@@ -105,7 +105,7 @@ def without_checksums(store: Path, rng: random.Random) -> str:
 
 
 def exchanged(store: Path, rng: random.Random) -> str:
-    """Two recordings change places; the store is made anew from them."""
+    """Two recordings change places; the store is rebuilt from them."""
     one, other = rng.sample(sorted((store.parent / "demos").glob("*.mcap")), 2)
     content = one.read_bytes()
     one.write_bytes(other.read_bytes())
