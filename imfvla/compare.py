@@ -17,6 +17,7 @@ from imfvla.command.line import quoted
 from imfvla.errors import UserError
 from imfvla.evaluate import read_nfe
 from imfvla.options import build
+from imfvla.storage.run_directory import RunDirectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +31,6 @@ class CompareOptions:
 
 @entry_point("compare")
 def _compare(config: dict[str, Any]) -> None:
-    # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.figures.style import render
-    from imfvla.figures.two_runs import two_runs
-    from imfvla.reporting.two_runs import compare_runs, table_of, verdict
-    from imfvla.storage.files import write_together
-    from imfvla.storage.run_directory import RunDirectory
-
     build(CompareOptions, config, "")
     if len(config["runs"]) != 2:
         raise UserError(
@@ -45,7 +39,16 @@ def _compare(config: dict[str, Any]) -> None:
     nfe = None if config["nfe"] is None else read_nfe(config["nfe"])
     if nfe is not None and len(nfe) > 2:
         raise UserError(f"nfe must be one number, or one for each run, found {nfe}.")
-    duels = compare_runs(*map(RunDirectory, config["runs"]), nfe)
+    runs = [RunDirectory(path) for path in config["runs"]]
+    for run in runs:
+        run.config()
+    # Imported late, so that a mistake in the command is reported at once.
+    from imfvla.figures.style import render
+    from imfvla.figures.two_runs import two_runs
+    from imfvla.reporting.two_runs import compare_runs, table_of, verdict
+    from imfvla.storage.files import write_together
+
+    duels = compare_runs(*runs, nfe)
     table, verdicts = table_of(duels), [verdict(duel) for duel in duels]
     text = "\n\n".join(verdicts)
     output = Path(config["output"])

@@ -17,19 +17,20 @@ from imfvla.storage.run_directory import RunDirectory
 
 @entry_point("evaluate")
 def main(config: dict[str, Any]) -> None:
-    # Imported late, so that a mistake in the config is reported at once.
-    from imfvla.reporting.table_row import print_row
-    from imfvla.rollouts.evaluation import evaluate
-    from imfvla.training.checkpoint import check_weights
-
     require(config["run"] is None or isinstance(config["run"], str), "run", "a directory", config["run"])
     if not config["run"]:
         raise UserError("evaluate needs the directory of a training run: run=runs/<experiment>/<name>.")
     wanted = {key: value for key, value in config.items() if key != "run"} | {"nfe": read_nfe(config["nfe"])}
     options = build(EvaluationOptions, wanted, "")
     run = RunDirectory(config["run"])
-    if not has_environment(trained := run.config()):
-        from imfvla.reporting.offline import print_offline
+    trained = run.config()
+    # Imported late, so that a mistake in the command is reported at once.
+    from imfvla.reporting.table_row import print_row
+    from imfvla.rollouts.evaluation import evaluate
+    from imfvla.training.checkpoint import check_weights
+
+    if not has_environment(trained):
+        from imfvla.reporting.offline_tables import print_offline
         from imfvla.rollouts.offline import evaluate_offline
 
         evaluate_offline(run, trained, options)

@@ -41,7 +41,7 @@ def main(config: dict[str, Any]) -> None:
 
             print_row(run)
         else:
-            from imfvla.reporting.offline import print_offline
+            from imfvla.reporting.offline_tables import print_offline
 
             print_offline(run)
         return

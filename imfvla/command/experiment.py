@@ -19,7 +19,7 @@ from imfvla.nn.pretrained import initialise_from_pretrained
 from imfvla.options import require
 from imfvla.policy import build_policy
 from imfvla.process.gl import select_gl_backend
-from imfvla.reporting.offline import print_offline
+from imfvla.reporting.offline_tables import print_offline
 from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
 from imfvla.rollouts.evaluation import evaluate

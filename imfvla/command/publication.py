@@ -21,7 +21,8 @@ from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import COMPARISONS, TableTitle
 from imfvla.reporting.mapping import Mapping as RowMapping
 from imfvla.reporting.media import Media
-from imfvla.reporting.offline import offline_table, read_offline
+from imfvla.reporting.offline import read_offline
+from imfvla.reporting.offline_tables import offline_table
 from imfvla.reporting.page import Picture, page
 from imfvla.reporting.published import published_rows
 from imfvla.reporting.results import Result

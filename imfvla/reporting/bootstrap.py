@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from imfvla.reporting.measured import Measured
 
@@ -82,7 +82,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
 def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: float) -> Bootstrapped:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of scipy, about cases that are handled below
-        found = stats.bootstrap(
+        found = scipy.stats.bootstrap(
             columns, statistic, paired=True, n_resamples=RESAMPLES, confidence_level=TAILS[1] - TAILS[0],
             method="BCa", rng=np.random.default_rng(0),
         )  # fmt: skip
@@ -116,7 +116,7 @@ def _hierarchical(statistic: Statistic, policies: Sequence[Columns], value: floa
     variance = np.var(both)
     freedom = variance**2 / sum(part**2 / free for part, free in parts)
     freedom = float(freedom) if np.isfinite(freedom) else np.inf
-    stretch = stats.t.ppf(TAILS[1], freedom) / stats.norm.ppf(TAILS[1])
+    stretch = scipy.stats.t.ppf(TAILS[1], freedom) / scipy.stats.norm.ppf(TAILS[1])
     low, high = (float(value + stretch * (end - value)) for end in _percentiles(both))
     return Bootstrapped(value, low, high, float(np.sqrt(variance)), freedom)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
 from imfvla.reporting.estimates import log_pooled_mean, share_difference
@@ -113,7 +113,9 @@ def _p_value(ours: np.ndarray, theirs: np.ndarray, found: Bootstrapped) -> tuple
     p = sign_flip(ours.mean(axis=0) - theirs.mean(axis=0))
     if max(len(ours), len(theirs)) == 1:
         return p, SIGN_FLIP
-    of_seeds = 2 * float(stats.t.sf(abs(found.value) / found.error, found.freedom)) if found.error else p
+    of_seeds = (
+        2 * float(scipy.stats.t.sf(abs(found.value) / found.error, found.freedom)) if found.error else p
+    )
     return max(p, of_seeds), SEEDS
 
 

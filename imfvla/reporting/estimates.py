@@ -6,7 +6,7 @@ Columns are (n,), or (S, n) where S training seeds met the same n starts; `boots
 import math
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from imfvla.reporting.bootstrap import TAILS, Statistic, bootstrap
 from imfvla.reporting.measured import Measured
@@ -46,10 +46,10 @@ def share(happened: np.ndarray) -> Measured:
     if len(happened) == 1:
         return Measured(value, *wilson_interval(int(happened.sum()), happened.size))
     found = bootstrap(np.mean, happened)
-    trials, score = happened.shape[1], float(stats.norm.ppf(TAILS[1]))
+    trials, score = happened.shape[1], float(scipy.stats.norm.ppf(TAILS[1]))
     if found.error:
         trials = min(value * (1 - value) / found.error**2, happened.size)
-        score = float(stats.t.ppf(TAILS[1], found.freedom))
+        score = float(scipy.stats.t.ppf(TAILS[1], found.freedom))
     return Measured(value, *wilson_interval(value * trials, trials, score))
 
 
@@ -100,7 +100,7 @@ def _located(statistic: Statistic, values: np.ndarray) -> Measured:
 
 def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The statistic of `interquartile_mean`."""
-    return stats.trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:

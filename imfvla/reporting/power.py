@@ -1,7 +1,7 @@
 """The smallest difference that so many pairs show: with probability 0.8, two-sided at 0.05."""
 
 import numpy as np
-from scipy import optimize, stats
+import scipy
 
 ALPHA = 0.05
 POWER = 0.8
@@ -26,18 +26,20 @@ def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float 
 
     if excess(1.0) < 0:
         return None
-    return float(optimize.brentq(excess, 0.0, 1.0, xtol=1e-6))
+    return float(scipy.optimize.brentq(excess, 0.0, 1.0, xtol=1e-6))
 
 
 def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
     """Probability that the exact McNemar test is significant, for psi = `disagreement` and delta = `difference`."""
     number = np.arange(pairs + 1)  # of pairs that disagree
     # successes of the worse side up to which a result is significant; sometimes one too many, corrected below
-    most = stats.binom.ppf(ALPHA / 2, number, 0.5)
-    most -= stats.binom.cdf(most, number, 0.5) > ALPHA / 2
+    most = scipy.stats.binom.ppf(ALPHA / 2, number, 0.5)
+    most -= scipy.stats.binom.cdf(most, number, 0.5) > ALPHA / 2
     better = 0.5 + 0.5 * difference / disagreement if disagreement else 0.5
-    significant = stats.binom.cdf(most, number, 1 - better) + stats.binom.cdf(most, number, better)
-    return float(stats.binom.pmf(number, pairs, disagreement) @ significant)
+    significant = scipy.stats.binom.cdf(most, number, 1 - better) + scipy.stats.binom.cdf(
+        most, number, better
+    )
+    return float(scipy.stats.binom.pmf(number, pairs, disagreement) @ significant)
 
 
 def detectable_difference(error: float, freedom: float = np.inf) -> float:
@@ -47,4 +49,4 @@ def detectable_difference(error: float, freedom: float = np.inf) -> float:
       error: of the difference; s / sqrt(n) for n pairs whose differences have the standard deviation s.
       freedom: degrees of freedom of t.
     """
-    return float((stats.t.ppf(1 - ALPHA / 2, freedom) + stats.t.ppf(POWER, freedom)) * error)
+    return float((scipy.stats.t.ppf(1 - ALPHA / 2, freedom) + scipy.stats.t.ppf(POWER, freedom)) * error)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+import scipy
 
 MOST_EXACT = 16  # pairs that differ; with more, sign flips are drawn
 FLIPS = 100_000
@@ -18,7 +18,7 @@ def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
     only_ours, only_theirs = int((ours & ~theirs).sum()), int((theirs & ~ours).sum())
     if only_ours + only_theirs == 0:
         return 1.0
-    return float(stats.binomtest(only_ours, only_ours + only_theirs, 0.5).pvalue)
+    return float(scipy.stats.binomtest(only_ours, only_ours + only_theirs, 0.5).pvalue)
 
 
 def sign_flip(differences: np.ndarray) -> float:
@@ -48,7 +48,7 @@ def signed_rank(differences: np.ndarray) -> float:
     """
     differences = np.asarray(differences, float)
     differences = differences[differences != 0]
-    return sign_flip(np.sign(differences) * stats.rankdata(np.abs(differences)))
+    return sign_flip(np.sign(differences) * scipy.stats.rankdata(np.abs(differences)))
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

@@ -14,7 +14,8 @@ from imfvla.command.experiment import run_experiment
 from imfvla.command.publication import publish
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.offline import HOLD, NEAREST, by_channel, by_step, offline_table, read_offline
+from imfvla.reporting.offline import HOLD, NEAREST, read_offline
+from imfvla.reporting.offline_tables import by_channel, by_step, offline_table
 from imfvla.rollouts.offline import _errors, _hold, _nearest
 from imfvla.storage.run_directory import RunDirectory
 

@@ -34,7 +34,8 @@ from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.media import Media
-from imfvla.reporting.offline import by_channel, by_step, offline_table, read_offline
+from imfvla.reporting.offline import read_offline
+from imfvla.reporting.offline_tables import by_channel, by_step, offline_table
 from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
 from imfvla.reporting.table_row import print_row
