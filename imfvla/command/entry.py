@@ -16,6 +16,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command, composition
+from imfvla.command.help import help_text
 from imfvla.command.jobs import Failure, HydraJob
 from imfvla.command.line import in_hydras_words, multiplies, refuse_ignored
 from imfvla.command.sweep import IsFinished, names_a_sweep, run_sweep
@@ -76,6 +77,10 @@ def _run(
             if usage and is_bare:
                 raise UserError(usage())
             composition.refuse_added_keys(job.config_name, known.overrides, more)
+            if known.help:
+                description = sys.modules[job.function.__module__].__doc__ or ""
+                print(help_text(job.config_name, description, known.overrides, more))
+                return 0
             if is_sweep:
                 failures = run_sweep(job, known.overrides, is_finished, more)
             else:
