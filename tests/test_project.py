@@ -105,8 +105,9 @@ LAYERS = [
     "modes rollouts",
     "command",
     "benchmarks",
+    "deployment",
     "bench collect convert evaluate gallery report scripts train",
-    "compare",
+    "compare export",
 ]
 LAYER = {room: number for number, rooms in enumerate(LAYERS) for room in rooms.split()}
 # What some of them must not know, though it lies above them: nn no robot, tables no simulator.
@@ -119,7 +120,7 @@ ONLY = {
 }
 SIMULATE = "tasks gymnasium_env"
 WHO_MAY = {  # of the heavy packages
-    "torch": "types nn encoders generators data policy training modes rollouts command benchmarks bench",
+    "torch": "types nn encoders generators data policy training modes rollouts command benchmarks bench deployment",
     "mujoco": SIMULATE,
     "dm_control": SIMULATE,
 }

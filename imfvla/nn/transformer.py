@@ -13,7 +13,7 @@ Shapes: B batch, H steps, A channels, K = H / patch tokens, L context tokens, D 
 """
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -49,6 +49,17 @@ class Conditioning:
 
     def rows(self, index: Tensor | slice) -> "Conditioning":
         return self.map(lambda x: x[index])
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All of it, in an order that `of` reads: what a graph hands from one call to the next."""
+        kept = tuple(tensor for block in self.blocks for tensor in block)
+        return kept if self.summary is None else (*kept, self.summary)
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> "Conditioning":
+        """Inverse of `tensors`."""
+        blocks = tuple(zip(tensors[0::2], tensors[1::2], strict=False))
+        return cls(blocks, tensors[-1] if len(tensors) % 2 else None)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Conditioning":
         blocks = tuple((function(keys), function(values)) for keys, values in self.blocks)

@@ -3,36 +3,17 @@
 import json
 import sys
 
-import numpy as np
 import pytest
-import torch
 from synthetic import write_demonstrations
 from test_hostile_files import load_tool
+from untrained_run import untrained_run
 
-from imfvla.command.composition import compose
-from imfvla.data.statistics import Statistics
-from imfvla.policy import build_policy
 from imfvla.sources.collection import recording_path
-from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import save_weights
-
-RUN = [
-    "+exp=socket_ph32_exec16", "observation.image_size=[32,32]", "demos.episodes=2", "horizon.pred=8",
-    "horizon.exec=4", "size.width=20", "core.depth=1", "training.steps=5",
-]  # fmt: skip
 
 
 @pytest.fixture
 def run(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    config = compose("train", RUN)
-    directory.claim(config)
-    numbers = np.random.default_rng(0).normal(size=(50, 16)).astype(np.float32)
-    chunks = np.repeat(numbers[:, None], 8, axis=1)
-    torch.manual_seed(0)
-    policy = build_policy(config, Statistics.of(numbers, numbers, chunks, np.ones((50, 8), bool)))
-    save_weights(directory.weights_directory(5), policy, {"step": 5})
-    return directory.path
+    return untrained_run(tmp_path / "run").path
 
 
 def test_the_tool_reports_on_recordings_that_the_run_was_not_trained_on(tmp_path, run, monkeypatch, capsys):

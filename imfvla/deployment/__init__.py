@@ -1,0 +1,1 @@
+"""A trained policy as ONNX graphs: what one deploys, without torch."""
