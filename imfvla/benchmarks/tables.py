@@ -108,7 +108,7 @@ def speed_ratios(
             for row in (comparison.baseline, comparison.row)
             if set(row.overrides) <= SAME_STEP
         ]
-        if comparison.of in SPEEDS and len(times) == 2 and all(times):
+        if comparison.paper and comparison.of in SPEEDS and len(times) == 2 and all(times):
             slow, fast = (time["median_ms"] for time in times if time)
             factor = math.exp(NORMAL_95 * math.hypot(*(time["log_error"] for time in times if time)))
             found[comparison.paper.label] = {

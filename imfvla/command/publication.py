@@ -119,7 +119,7 @@ def _formats(document: Document) -> dict[str, str]:
 
 def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> Document:
     if table.of == COMPARISONS:
-        return comparison_table(table.title, compare(mapping.comparisons, results))
+        return comparison_table(table.title, compare(mapping.of_comparisons(table.name), results))
     rows = [result for result in results if result.row.table == table.name]
     return row_table(table.title, rows, published=published_rows(table.task))
 

@@ -14,9 +14,9 @@ from imfvla.reporting.results import Result
 
 
 def success_by_cost(results: Sequence[Result]) -> Figure:
-    """Success of a table's rows against NFE and against the time of a chunk, a line for each method.
+    """Success of a table's rows against NFE and against the median time of a chunk, a line for each method.
 
-    The legend has the mean time of its trainings.
+    The mean time would show a pause of the machine. The legend has the mean time of the trainings.
     """
     measured = sorted((r for r in results if not r.is_missing), key=lambda r: (r.row.method, r.nfe))
     lines = {method: [*line] for method, line in groupby(measured, key=lambda r: r.row.method)}
@@ -25,7 +25,7 @@ def success_by_cost(results: Sequence[Result]) -> Figure:
         figure = new_figure(WIDTH, 3.9)
         left, right = figure.subplots(1, 2, sharey=True)
         left.set_xlabel("network calls for a chunk (NFE), log axis")
-        right.set_xlabel("time of a chunk [ms], log axis")
+        right.set_xlabel("median time of a chunk [ms], log axis")
         left.set_ylabel("success-like [%]")
         if not order:
             for axes in (left, right):
@@ -35,7 +35,7 @@ def success_by_cost(results: Sequence[Result]) -> Figure:
             line = lines[method]
             shift = 1.06 ** (number - (len(order) - 1) / 2)  # so that intervals do not hide each other
             _draw(left, line, [shift * r.nfe for r in line], number, method)
-            _draw(right, line, [r.metrics["inference_ms_mean"].value for r in line], number, method)
+            _draw(right, line, [r.metrics["inference_ms_median"].value for r in line], number, method)
         nfe_ticks(left, (r.nfe for r in measured))
         right.set_xscale("log")
         plain_log_ticks(right.xaxis)

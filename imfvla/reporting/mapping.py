@@ -36,7 +36,7 @@ class TaskTitle:
 
 @dataclass(frozen=True, slots=True)
 class TableTitle:
-    """A table of rows of one task, or the table of comparisons between rows.
+    """A table of rows of one task, or of comparisons between rows, which are corrected together.
 
     `printed` is its number in the paper, None where the paper has no such table; `figure` draws its rows.
     """
@@ -91,13 +91,17 @@ class TableRow:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A row of the comparisons: `of` of a row against that of its baseline, as one of OPERATIONS."""
+    """A row of comparisons: `of` of a row against that of its baseline, as one of OPERATIONS.
 
+    `paper` is the printed comparison, None where the paper does not have it.
+    """
+
+    table: str  # name of its table
     row: TableRow
     baseline: TableRow
     of: str  # one of COMPARED
     operation: str
-    paper: PaperComparison
+    paper: PaperComparison | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +127,9 @@ class Mapping:
     def of_table(self, name: str) -> tuple[TableRow, ...]:
         return tuple(row for row in self.rows if row.table == name)
 
+    def of_comparisons(self, name: str) -> tuple[Comparison, ...]:
+        return tuple(comparison for comparison in self.comparisons if comparison.table == name)
+
     def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
         """The first row of an experiment, a `run_key` and an NFE, whatever its checkpoint."""
         wanted = (experiment, run, nfe)
@@ -143,11 +150,11 @@ class _RowEntry:
 
 @dataclass(frozen=True, slots=True)
 class _ComparisonEntry:
-    paper: str
     row: str
     baseline: str
     of: str
     operation: str
+    paper: str | None = None
 
 
 @cache
@@ -175,8 +182,9 @@ def read_mapping(path: Path = PATH) -> Mapping:
                 _comparison(entry, table, number, path, by_name)
                 for number, entry in enumerate(entries(content, table.name, path), 1)
             ]
-            printed = [comparison.label for comparison in paper_comparisons(table.printed)]
-            _check_each_once([c.paper.label for c in found], printed, table, path)
+            if table.printed is not None:
+                printed = [comparison.label for comparison in paper_comparisons(table.printed)]
+                _check_each_once([c.paper.label for c in found if c.paper], printed, table, path)
             comparisons += found
     return Mapping(tasks, tables, tuple(rows), tuple(comparisons))
 
@@ -213,10 +221,6 @@ def _check_tables(tables: Sequence[TableTitle], tasks: Sequence[TaskTitle], path
         if table.of == ROWS:
             require(table.task is not None, f"{where}.task", f"one of {', '.join(known)}", table.task)
             named(table.task, known, f"{where}: unknown task")
-        else:
-            require(table.printed is not None, f"{where}.printed", "given: comparisons are the paper's", None)
-    compared = [table.name for table in tables if table.of == COMPARISONS]
-    require(len(compared) <= 1, f"{path}: tables", "at most one of comparisons", compared)
 
 
 def _row(entry: dict[str, Any], table: TableTitle, number: int, path: Path, default: Wanted) -> TableRow:
@@ -263,13 +267,17 @@ def _comparison(
     read = build(_ComparisonEntry, values, where)
     require(read.operation in OPERATIONS, f"{where}: as", " or ".join(OPERATIONS), read.operation)
     require(read.of in COMPARED, f"{where}: of", " or ".join(COMPARED), read.of)
-    printed = {comparison.label: comparison for comparison in paper_comparisons(table.printed)}
+    paper = None
+    if table.printed is not None or read.paper is not None:
+        labels = {} if table.printed is None else {c.label: c for c in paper_comparisons(table.printed)}
+        paper = named(read.paper, labels, f"{where}: unknown row of the paper's Table {table.printed}")
     return Comparison(
+        table=table.name,
         row=named(read.row, rows, f"{where}: unknown row"),
         baseline=named(read.baseline, rows, f"{where}: unknown row"),
         of=read.of,
         operation=read.operation,
-        paper=named(read.paper, printed, f"{where}: unknown row of the paper's Table {table.printed}"),
+        paper=paper,
     )
 
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+from imfvla.reporting.cells import BY_NAME
 from imfvla.reporting.comparisons import Compared
+from imfvla.reporting.mapping import Comparison, TableRow
 from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
 
 
@@ -21,7 +23,7 @@ def detectable_success(pairs: int) -> str:
 def pairing(compared: Sequence[Compared]) -> tuple[str, ...]:
     """How measured comparisons were made, and the smallest result that they would have shown."""
     tests = ", ".join(dict.fromkeys(found.test for found in compared))
-    each = "; ".join(f"{found.comparison.paper.label} {_detectable(found)}" for found in compared)
+    each = "; ".join(f"{label(found.comparison)} {_detectable(found)}" for found in compared)
     return (
         "Ours: pairs of episodes from the same starts with the same noise seed. In brackets: 95% intervals, of "
         "differences of counts Newcombe's, else BCa bootstrap over pairs; with several training seeds bootstrap over "
@@ -29,6 +31,27 @@ def pairing(compared: Sequence[Compared]) -> tuple[str, ...]:
         f"Smallest detectable results in favour of the row, with probability {POWER} at p = {ALPHA}, each comparison "
         f"by itself: {each}.",
     )
+
+
+def names(comparison: Comparison) -> tuple[str, str]:
+    """What is compared and by what: the paper's words, or ours of both rows and the title of the column."""
+    if comparison.paper:
+        return comparison.paper.comparison, comparison.paper.metric
+    row, baseline = comparison.row, comparison.baseline
+    common = set(row.setting.split(", ")) & set(baseline.setting.split(", "))
+    # what both rows have is not said, but how often they call the network is
+    common = {part for part in common if not part.startswith("infer")}
+    return f"{_short(row, common)} vs {_short(baseline, common)}", BY_NAME[comparison.of].title
+
+
+def label(comparison: Comparison) -> str:
+    """Both of `names`."""
+    return ", ".join(names(comparison))
+
+
+def _short(row: TableRow, common: set[str]) -> str:
+    own = [part for part in row.setting.split(", ") if part not in common]
+    return f"{row.method} ({', '.join(own)})" if own else row.method
 
 
 def _detectable(found: Compared) -> str:

@@ -8,7 +8,7 @@ from imfvla.reporting.comparisons import Compared
 from imfvla.reporting.mapping import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import METRICS
-from imfvla.reporting.notes import detectable_success, pairing
+from imfvla.reporting.notes import detectable_success, label, names, pairing
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
@@ -90,14 +90,14 @@ def other_table(results: Sequence[Result]) -> Document:
 
 
 def comparison_table(title: str, compared: Sequence[Compared], notes: Sequence[str] = ()) -> Document:
-    """Every ratio that the paper prints, from our rows."""
+    """Rows of ours against each other: every ratio that the paper prints, beside it, or differences of our own."""
+    has_paper = any(found.comparison.paper for found in compared)
     cells = []
     for found in compared:
         paper = found.comparison.paper
+        printed = ((paper.result if paper else NOTHING),) if has_paper else ()
         ours = MISSING if found.is_missing else REFUSED if found.refused else shown(found)
-        cells.append(
-            (paper.comparison, paper.metric, paper.result, ours, p_value(found.p), p_value(found.p_holm))
-        )
+        cells.append((*names(found.comparison), *printed, ours, p_value(found.p), p_value(found.p_holm)))
     commands = {
         result.row.label: result.answer.command
         for found in compared
@@ -108,11 +108,9 @@ def comparison_table(title: str, compared: Sequence[Compared], notes: Sequence[s
     if measured:
         notes = (*notes, *pairing(measured))
     refused = tuple(
-        f"{found.comparison.paper.label}: refused, because {found.refused}."
-        for found in compared
-        if found.refused
+        f"{label(found.comparison)}: refused, because {found.refused}." for found in compared if found.refused
     )
-    columns = ("Comparison", "Metric", "Paper", "Ours", "p", "p (Holm)")
+    columns = ("Comparison", "Metric", *(("Paper",) if has_paper else ()), "Ours", "p", "p (Holm)")
     keys = tuple((found.row.name, found.baseline.name) for found in compared)
     table = Table(title, columns, tuple(cells), (*notes, *refused), keys, tuple(commands.items()))
     return Document(table, Table(title, *_comparison_data(compared)))
@@ -141,7 +139,8 @@ def shown(found: Compared) -> str:
         return with_interval(found.result, 2, "×")
     value = found.result
     bounds = TOO_FEW if value.low is None else f"[{value.low:+.1f}, {value.high:+.1f}]"
-    return f"{value.value:+g} {bounds}"
+    number = f"{value.value:+g}" if float(value.value).is_integer() else f"{value.value:+.1f}"
+    return f"{number} {bounds}"
 
 
 def p_value(p: float | None) -> str:
@@ -235,8 +234,9 @@ def _comparison_data(compared: Sequence[Compared]) -> tuple[tuple[str, ...], tup
         )
         cells.append(
             (
-                paper.comparison, paper.metric, found.row.name, found.baseline.name, comparison.of,
-                comparison.operation, paper.result, *("" if value is None else f"{value:.6g}" for value in numbers),
+                *names(comparison), found.row.name, found.baseline.name, comparison.of,
+                comparison.operation, paper.result if paper else "",
+                *("" if value is None else f"{value:.6g}" for value in numbers),
                 MISSING if found.is_missing else REFUSED if found.refused else "measured", found.refused or "",
             )
         )  # fmt: skip
