@@ -96,8 +96,11 @@ def _check_arguments(target: type, part: Mapping[str, Any], key: str) -> None:
     for cls in reversed(target.__mro__[:-1]):
         hints |= _hints_of(cls.__init__)
     for argument, value in part.items():
-        if _is_checked(hints.get(argument)):
-            convert(value, hints[argument], f"{key}.{argument}")
+        hint = hints.get(argument)
+        if _is_checked(hint):
+            convert(value, hint, f"{key}.{argument}")
+        elif value is None and hint not in (None, Any):  # types that are not checked, such as a function
+            require(types.NoneType in get_args(hint), f"{key}.{argument}", "given, as in conf/", None)
 
 
 def _hints_of(constructor: Any) -> dict[str, Any]:
