@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla.command.missing import refuse_missing
-from imfvla.config.assets import folder, install_command
+from imfvla.config.assets import folder, install_command, shown
 from imfvla.errors import UserError
 from imfvla.options import require, suggestion
 from imfvla.storage.run_names import key_of, run_name
@@ -169,7 +169,8 @@ def explain(
     if merged := _MERGED.search(text):
         key, is_mapping = merged.group(1), merged.group(2) == "dict"
         return UserError(
-            f"{key} must be {_KINDS[is_mapping]}, found {_KINDS[not is_mapping]}: write it as in conf/."
+            f"{key} must be {_KINDS[is_mapping]}, found {_KINDS[not is_mapping]}: write it as in "
+            f"{shown(CONFIG_DIRECTORY)}."
         )
     return UserError(
         f"The config {config_name} with {' '.join(overrides) or 'no overrides'} is wrong: {text}"

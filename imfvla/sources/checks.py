@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.config.assets import folder, install_command
+from imfvla.config.assets import folder, install_command, shown
 from imfvla.errors import UserError, unreadable
 from imfvla.options import Limit
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES
@@ -71,8 +71,8 @@ def missing_extra(extra: str, error: ImportError) -> UserError:
 
 
 def documented(kind: str) -> str:
-    """Where a user reads what the options of a source mean: "see .../conf/demos/ros2.yaml"."""
-    return f"see {folder('conf') / 'demos' / kind}.yaml"
+    """Where a user reads what the options of a source mean: "see conf/demos/ros2.yaml"."""
+    return f"see {shown(folder('conf') / 'demos' / f'{kind}.yaml')}"
 
 
 def channels(names: Sequence[str], key: str, *, need_units: bool) -> tuple[str, ...]:

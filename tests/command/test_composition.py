@@ -26,7 +26,7 @@ from imfvla.errors import UserError
         (["task=[socket,transfer]"], r"task must be one of its files, .* -m with task=A,B"),
         (
             ["horizon=[1]"],
-            r"^horizon must be a mapping of keys to values, found a list: write it as in conf/",
+            r"^horizon must be a mapping of keys to values, found a list: write it as in .*conf\.",
         ),
         (["observation.views={front: 1}"], r"^observation\.views must be a list, found a mapping"),
     ],

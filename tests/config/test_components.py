@@ -151,7 +151,7 @@ def test_arguments_are_checked_and_a_contract_is_held(mark):
 
 
 def test_null_for_what_must_be_given_is_named():
-    with pytest.raises(UserError, match=r"generator\.times must be given, as in conf/, found None"):
+    with pytest.raises(UserError, match=r"generator\.times must be given, as in .*conf, found None"):
         construct(compose("train", ["generator.times=null"])["generator"], "generator")
 
 
