@@ -18,7 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command, composition
 from imfvla.command.jobs import Failure, HydraJob
 from imfvla.command.line import in_hydras_words, multiplies, refuse_ignored
-from imfvla.command.sweep import IsFinished, names_a_sweep, run_sweep
+from imfvla.command.planning import names_a_sweep
+from imfvla.command.sweep import IsFinished, run_sweep
 from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
 from imfvla.process.visible import visible
 

@@ -36,8 +36,8 @@ GRIPPER_NOTE = (
     "after closing; whose gripper is neither open nor closed for more than 3 steps."
 )
 TURN_NOTE = (
-    f"Wrists that may roll either way, at {{num}} starts, after {turns.STEPS} steps: samples within {turns.BRIDGE:g} rad "
-    f"of the middle of both ways, beyond {turns.ARRIVED:g} rad, mean roll."
+    f"Wrists that may roll either way, at {{num}} starts, after {turns.STEPS} steps: samples within "
+    f"{turns.BRIDGE:g} rad of the middle of both ways, beyond {turns.ARRIVED:g} rad, mean roll."
 )
 SPREAD_NOTE = (
     "Spread, at {num} decisions: standard deviation of samples over their noise at one observation, in units of the "
