@@ -95,6 +95,7 @@ def of_length(entries: int) -> Limit:
     return Limit(f"a list of {entries} entries", lambda value: len(value) == entries)
 
 
+DIFFERENT = Limit("values that all differ", lambda values: len(set(values)) == len(values))
 SHARE_BELOW_1 = Limit("in [0, 1)", lambda value: 0 <= value < 1)
 
 

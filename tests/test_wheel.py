@@ -12,6 +12,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 BESIDE = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "experiments/tables.yaml")
+TINY = [
+    "observation.image_size=[16,24]", "size.width=20", "size.heads=2", "size.depth=1", "horizon.pred=4",
+    "horizon.exec=2", "training.batch_size=2", "training.steps=2", "training.checkpoints=1", "evaluation.nfe=[1]",
+]  # fmt: skip
 COMPOSE = """
 import json
 import imfvla
@@ -94,6 +98,34 @@ def test_the_script_of_a_command_takes_configs_of_ones_own(unpacked, tmp_path, b
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("name: own\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_data_set_of_lerobot_is_trained_on_judged_and_written_back(unpacked, tmp_path):
+    """What docs/data.md shows, in an empty directory."""
+    pytest.importorskip("pyarrow", reason="needs the extra lerobot")
+    from outside import ROBOT, episode, options
+
+    from imfvla.sources.lerobot import LeRobotWriter, open_source
+
+    with LeRobotWriter(tmp_path / "arm", ROBOT, pictures="png") as writer:
+        for number in range(3):
+            writer.add(episode(number))
+    train = "import imfvla.scripts; imfvla.scripts.train()"
+    data = ["task=none", "demos=lerobot", "demos.path=arm", "observation.views=[front]", "name=mine"]
+    done = run(unpacked, tmp_path, "-c", train, *data, "task.held_out=1", *TINY)
+    assert done.returncode == 0, done.stderr
+    (table,) = tmp_path.glob("runs/mine/*/offline.md")
+    assert "shoulder" in table.read_text(encoding="utf-8")
+    convert = "import imfvla.scripts; imfvla.scripts.convert()"
+    ways = ["from=lerobot", "from.path=arm", "to=lerobot", "to.path=back", "to.pictures=png"]
+    done = run(unpacked, tmp_path, "-c", convert, *ways)
+    assert (done.returncode, done.stdout) == (0, "back: 3 episodes, 24 steps.\n"), done.stderr
+    source = open_source(options("lerobot", path=str(tmp_path / "back")))
+    assert source.robot == ROBOT
+    for number in range(3):
+        read, made = source.episode(number, ("front", "wrist")), episode(number)
+        assert (read.action == made.action).all()
+        assert all((read.images[view] == frames).all() for view, frames in made.images.items())
 
 
 def test_its_results_name_no_commit_of_the_project_that_it_is_installed_in(unpacked, tmp_path):

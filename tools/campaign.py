@@ -30,7 +30,7 @@ from threading import Lock
 
 from imfvla.command.completion import is_reported
 from imfvla.command.composition import register_resolvers
-from imfvla.command.sweep import Planned, planned_jobs
+from imfvla.command.planning import Planned, planned_jobs
 from imfvla.errors import UserError
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped

@@ -1,6 +1,6 @@
 """Checks recorded episodes: checksums, counts, times and pictures. Exits with 1 if any file fails.
 
-python tools/mcap_check.py runs/demos/socket            # every *.mcap below a directory
+python tools/mcap_check.py data/demos                   # every *.mcap below a directory
 python tools/mcap_check.py episode.mcap other.mcap
 """
 

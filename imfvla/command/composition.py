@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from imfvla.command.missing import refuse_missing
-from imfvla.config.assets import folder, install_command
+from imfvla.config.assets import folder, install_command, shown
 from imfvla.errors import UserError
 from imfvla.options import require, suggestion
 from imfvla.storage.run_names import key_of, run_name
@@ -36,6 +36,8 @@ CONFIG_DIRECTORY = folder("conf")
 VERSION_BASE = "1.3"
 SEARCH_PATH = "hydra.searchpath"
 COMMAND_LINE = "command-line"  # what Hydra calls the provider of --config-dir
+_MERGED = re.compile(r"Cannot merge \w+ with \w+ full_key: (\S+) object_type=(dict|list)")
+_KINDS = ("a list", "a mapping of keys to values")
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +126,8 @@ def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | N
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     for place in [place for override in parsed for place in _places(override)]:
         _refuse_absent(place)
+    for override in parsed:
+        _refuse_list_of_choices(override)
     added = [override.key_or_group for override in parsed if override.is_add()]
     unknown = [key for key in added if not key.startswith("hydra") and not (CONFIG_DIRECTORY / key).is_dir()]
     groups = _groups(unknown, config_name, overrides, more)
@@ -162,6 +166,12 @@ def explain(
     if isinstance(error, ConfigCompositionException) and overridden and "Could not override" in str(error):
         return _unknown_key(overridden.group(1).split("@")[0], config_name, overrides, more)
     text = " ".join(str(error.__cause__ or error).split())
+    if merged := _MERGED.search(text):
+        key, is_mapping = merged.group(1), merged.group(2) == "dict"
+        return UserError(
+            f"{key} must be {_KINDS[is_mapping]}, found {_KINDS[not is_mapping]}: write it as in "
+            f"{shown(CONFIG_DIRECTORY)}."
+        )
     return UserError(
         f"The config {config_name} with {' '.join(overrides) or 'no overrides'} is wrong: {text}"
     )
@@ -175,6 +185,16 @@ def _places(override: Override) -> list[str]:
     is_list = isinstance(places, list) and all(isinstance(place, str) for place in places)
     require(is_list, SEARCH_PATH, "a list of folders (file://DIR) and packages (pkg://NAME)", places)
     return places
+
+
+def _refuse_list_of_choices(override: Override) -> None:
+    """Raises UserError where a group is given a list, which Hydra would take for several of its files."""
+    is_group = (CONFIG_DIRECTORY / override.key_or_group).is_dir()
+    if is_group and not override.is_delete() and isinstance(values := override.value(), list):
+        raise UserError(
+            f"{override.key_or_group} must be one of its files, found the list {values!r}: write "
+            f"{override.key_or_group}=NAME, and -m with {override.key_or_group}=A,B to run several."
+        )
 
 
 def _refuse_absent(place: str) -> None:

@@ -19,7 +19,8 @@ from imfvla.command import EXIT_FAILURE, EXIT_USER_ERROR, as_command, compositio
 from imfvla.command.help import help_text
 from imfvla.command.jobs import Failure, HydraJob
 from imfvla.command.line import in_hydras_words, multiplies, refuse_ignored
-from imfvla.command.sweep import IsFinished, names_a_sweep, run_sweep
+from imfvla.command.planning import names_a_sweep
+from imfvla.command.sweep import IsFinished, run_sweep
 from imfvla.errors import REMEDIES, WHERE_MISSING, UserError, as_user_error
 from imfvla.process.visible import visible
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from imfvla.config.assets import folder
+from imfvla.config.assets import folder, shown
 from imfvla.errors import UserError
 
 LINE = re.compile(r"(\w+):\s*\?\?\?\s*(?:#\s*(.*?)\s*)?")  # key: ??? # what it is
@@ -25,7 +25,7 @@ def refuse_missing(config: DictConfig) -> None:
     for parent, keys in groups.items():
         file = _file_of(OmegaConf.select(config, parent) if parent else config)
         notes = _notes(file) if file else {}
-        files += [f"conf/{file.relative_to(folder('conf')).as_posix()}"] if file else []
+        files += [shown(file)] if file else []
         for key in keys:
             note = notes.get(key.rpartition(".")[2])
             named.append(f"{key} ({note})" if note else key)

@@ -14,6 +14,12 @@ def folder(name: str) -> Path:
     return inside if inside.is_dir() else PACKAGE.parent / name
 
 
+def shown(path: Path) -> str:
+    """A file of this installation as a user opens it: from the working directory where it lies below, else absolute."""
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
 def install_command(extra: str) -> str:
     """What installs an extra of pyproject.toml: from the clone where this is one, else for the installed wheel."""
     is_wheel = folder("conf").parent == PACKAGE

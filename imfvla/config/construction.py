@@ -13,6 +13,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
+from imfvla.config.assets import folder, shown
 from imfvla.config.components import GROUP, refuse_incomplete, registered, targets
 from imfvla.errors import UserError
 from imfvla.options import convert, is_whole, require
@@ -96,8 +97,16 @@ def _check_arguments(target: type, part: Mapping[str, Any], key: str) -> None:
     for cls in reversed(target.__mro__[:-1]):
         hints |= _hints_of(cls.__init__)
     for argument, value in part.items():
-        if _is_checked(hints.get(argument)):
-            convert(value, hints[argument], f"{key}.{argument}")
+        hint = hints.get(argument)
+        if _is_checked(hint):
+            convert(value, hint, f"{key}.{argument}")
+        elif value is None and hint not in (None, Any):  # types that are not checked, such as a function
+            require(
+                types.NoneType in get_args(hint),
+                f"{key}.{argument}",
+                f"given, as in {shown(folder('conf'))}",
+                None,
+            )
 
 
 def _hints_of(constructor: Any) -> dict[str, Any]:

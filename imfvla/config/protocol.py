@@ -7,7 +7,7 @@ from fractions import Fraction
 from itertools import chain
 from typing import Annotated, Any
 
-from imfvla.options import Limit, above, at_least, one_of, require, some, within
+from imfvla.options import DIFFERENT, Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
 # Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
@@ -51,7 +51,7 @@ class EvaluationOptions:
 
     episodes: Annotated[int, within(1, MAX_EPISODES)]
     first_seed: Annotated[int, within(0, MAX_SEED)]
-    nfe: Annotated[tuple[int, ...], some(at_least(1))]
+    nfe: Annotated[tuple[int, ...], some(at_least(1)), DIFFERENT]
     checkpoint: Annotated[int | str, CHECKPOINT] = LAST
     noise_seed: Annotated[int, within(0, MAX_SEED)] = 0
     noise_scale: Annotated[float, within(0, 1)] = USUAL_NOISE

@@ -113,7 +113,7 @@ class Windows:
         if not len(self._frame) or (self.horizon.obs > 1 and not self.store.image_steps[self._frame].any()):
             raise UserError(
                 f"horizon.obs={self.horizon.obs} needs frames at that many consecutive control steps, and "
-                f"the episodes in {self.store.path} have none: collect with camera_every=1, or set "
+                f"the episodes in {self.store.path} have none: set demos.camera_every=1, or "
                 "horizon.obs=1."
             )
 

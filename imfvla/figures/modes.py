@@ -102,7 +102,7 @@ def _wrists(measured: Mapping[str, Any], left: Axes, right: Axes) -> None:
     for index, (name, row) in enumerate(rows.items()):
         density, _ = np.histogram(row["rolls"], edges, density=True)
         left.stairs(density, edges, label=_label(name), **_look(index))
-    left.set(xlabel="roll within 16 steps [rad] (grey: between both ways)", ylabel="density of samples")
+    left.set(xlabel="roll of a wrist [rad] (grey: between both ways)", ylabel="density of samples")
     left.set_title("Which way the wrist rolls")
     left.legend(loc="upper center")
     places = np.arange(len(rows))

@@ -133,9 +133,15 @@ def cameras_of(package: str | None, env: Any) -> Cameras | None:
 
 
 def version_of(package: str | None) -> str:
-    """The package and its version, such as "gym_aloha 0.1.3"."""
+    """The package and its version, such as "gym_aloha 0.1.3".
+
+    Its distribution may have another name; an entry point says which. Without any version the name alone.
+    """
     name = package or "gymnasium"
+    for point in (point for group in GROUPS for point in metadata.entry_points(group=group)):
+        if _package_of(point) == name and point.dist is not None:
+            return f"{name} {point.dist.version}"
     try:
         return f"{name} {metadata.version(name)}"
-    except metadata.PackageNotFoundError:  # a distribution of another name
+    except metadata.PackageNotFoundError:  # such as of a folder on PYTHONPATH
         return name

@@ -36,8 +36,8 @@ GRIPPER_NOTE = (
     "after closing; whose gripper is neither open nor closed for more than 3 steps."
 )
 TURN_NOTE = (
-    "Wrists that may roll either way, at {num} starts, after 16 steps: samples within 0.25 rad of the middle of both "
-    "ways, beyond 0.75 rad, mean roll."
+    f"Wrists that may roll either way, at {{num}} starts, after {turns.STEPS} steps: samples within "
+    f"{turns.BRIDGE:g} rad of the middle of both ways, beyond {turns.ARRIVED:g} rad, mean roll."
 )
 SPREAD_NOTE = (
     "Spread, at {num} decisions: standard deviation of samples over their noise at one observation, in units of the "

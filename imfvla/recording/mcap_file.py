@@ -30,6 +30,10 @@ class TruncatedRecording(UserError):
     """A recording that ends before its end."""
 
 
+class ForeignRecording(ValueError):
+    """A whole MCAP file of another program; the text says what it lacks."""
+
+
 def records(data: bytes) -> Iterator[McapRecord]:
     """The records of a file, chunks unpacked and checksums verified; at most one chunk is in memory.
 
@@ -62,7 +66,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     elif chunk.compression == "":
         content = chunk.data
     else:
-        raise ValueError(f"compression {chunk.compression!r}, wanted zstd, lz4 or none")
+        raise NotImplementedError(f"compression {chunk.compression!r}, wanted zstd, lz4 or none")
     if len(content) != chunk.uncompressed_size:
         found = f"{len(content)}" if len(content) < most else "more"
         raise ValueError(f"a chunk of {found} bytes that states {chunk.uncompressed_size}")
@@ -109,6 +113,10 @@ def clear_read_errors(path: Path) -> Iterator[None]:
         raise UserError(
             f"Recording {path} does not exist: give the path of a recorded .mcap file."
         ) from error
+    except NotImplementedError as error:
+        raise UserError(
+            f"Recording {path} is not supported ({error}): rewrite it with `mcap compress`, or record it again."
+        ) from error
     except Exception as error:  # a damaged byte can raise anything from EndOfFile to KeyError
         # EINVAL comes from a damaged offset.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
@@ -125,6 +133,11 @@ def clear_read_errors(path: Path) -> Iterator[None]:
             raise TruncatedRecording(
                 f"Recording {path} is truncated after its data, which may be complete: copy it again, or "
                 "rewrite it with `mcap recover`."
+            ) from error
+        if isinstance(error, ForeignRecording):
+            raise UserError(
+                f"Recording {path} is no episode of imfvla: it must have {error}, found none. Bags of ROS 2 are read "
+                "with demos=ros2; move other files to another folder."
             ) from error
         reason = f"{type(error).__name__} {error}".strip()
         raise UserError(

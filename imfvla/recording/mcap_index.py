@@ -95,9 +95,7 @@ def _index(
     data_crc: int,
     metadata: Mapping[str, dict[str, str]],
 ) -> EpisodeIndex:
-    for name in messages.RECORDS:
-        if name not in metadata:
-            raise ValueError(f"no metadata record {name}")
+    messages.require_records(metadata)
     cameras = {topic: count for topic, count in counts.items() if topic.startswith(messages.CAMERA)}
     frames = {topic.removeprefix(messages.CAMERA): count for topic, count in cameras.items()}
     info = messages.read_info(metadata[messages.EPISODE_RECORD], {}, path)

@@ -66,9 +66,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment) and record.name == messages.CONFIG_ATTACHMENT:
             config = parse_json(record.data)  # never extracted, so its name is no path
-    for name in messages.RECORDS:
-        if name not in metadata:
-            raise ValueError(f"no metadata record {name}")
+    messages.require_records(metadata)
     info = messages.read_info(metadata[messages.EPISODE_RECORD], config, path)
     result = messages.read_result(metadata[messages.RESULT_RECORD], path)
 

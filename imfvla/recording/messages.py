@@ -7,6 +7,7 @@ it, a non-finite one as null.
 
 import base64
 import json
+from collections.abc import Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from imfvla.episode import EpisodeInfo, EpisodeResult
 from imfvla.errors import UserError
+from imfvla.recording.mcap_file import ForeignRecording
 from imfvla.recording.records import Config, InfoRecord, ResultRecord
 from imfvla.robot import RobotSpec
 from imfvla.storage.documents import parse_json
@@ -81,6 +83,15 @@ def info_record(info: EpisodeInfo) -> dict[str, str]:
     values = {field.name: getattr(info, field.name) for field in fields(info) if field.name != "config"}
     values["robot"] = info.robot.to_json()
     return {"format": FORMAT} | {name: dump(value).decode() for name, value in values.items()}
+
+
+def require_records(found: Collection[str]) -> None:
+    """Raises ForeignRecording where a file has no record of ours among those `found`, ValueError where it lacks one."""
+    missing = [name for name in RECORDS if name not in found]
+    if len(missing) == len(RECORDS):
+        raise ForeignRecording(f"the metadata record {EPISODE_RECORD}")
+    if missing:
+        raise ValueError(f"no metadata record {missing[0]}")
 
 
 def read_info(record: dict[str, str], config: dict[str, Any], path: Path) -> EpisodeInfo:

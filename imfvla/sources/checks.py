@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from imfvla.config.assets import folder, install_command, shown
 from imfvla.errors import UserError, unreadable
+from imfvla.options import Limit
 from imfvla.recording.mcap_file import MAX_EPISODE_BYTES
 from imfvla.robot import MAX_CHANNELS, bare_name, unit_of
 
 MAX_EPISODES = 1_000_000  # of one source
 MAX_STEPS = 1_000_000  # of one episode: 5 hours at 50 Hz
 NARROWEST = 1e-3  # range of a channel that never moves, to both sides [its unit]
+SENTENCE = Limit("a sentence", lambda text: bool(text.strip()))
 
 
 def misfit(place: str | Path, key: str, wanted: str, found: Any, remedy: str) -> UserError:
@@ -63,9 +66,13 @@ def read_errors_told(
 def missing_extra(extra: str, error: ImportError) -> UserError:
     """The error of a reader whose package is not installed."""
     return UserError(
-        f"Reading or writing {extra} data needs {error.name}, found it not installed: "
-        f"pip install -c constraints.txt -e '.[{extra}]'."
+        f"Reading or writing {extra} data needs {error.name}, found it not installed: run `{install_command(extra)}`."
     )
+
+
+def documented(kind: str) -> str:
+    """Where a user reads what the options of a source mean: "see conf/demos/ros2.yaml"."""
+    return f"see {shown(folder('conf') / 'demos' / f'{kind}.yaml')}"
 
 
 def channels(names: Sequence[str], key: str, *, need_units: bool) -> tuple[str, ...]:
@@ -73,6 +80,7 @@ def channels(names: Sequence[str], key: str, *, need_units: bool) -> tuple[str, 
 
     Raises UserError naming the key.
     """
+    refuse_repeated(names, key)
     for name in names:
         if not bare_name(name).strip():
             raise UserError(
@@ -86,6 +94,15 @@ def channels(names: Sequence[str], key: str, *, need_units: bool) -> tuple[str, 
     if not 1 <= len(names) <= MAX_CHANNELS:
         raise UserError(f"{key} must have 1 to {MAX_CHANNELS} channels, found {len(names)}.")
     return tuple(names)
+
+
+def refuse_repeated(names: Sequence[str], key: str) -> None:
+    """Raises UserError where two channels have one name, whatever their units."""
+    plain = [bare_name(name) for name in names]
+    if repeated := sorted({name for name in plain if plain.count(name) > 1}):
+        raise UserError(
+            f"{key} must have names that all differ, found {shortened(', '.join(repeated))} more than once: rename one."
+        )
 
 
 def displaced(
@@ -125,7 +142,8 @@ def action_range(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Limits of the actions: those that the options state, else the least and greatest values seen (A,).
 
-    A channel that never moves gets a narrow range. Raises UserError where the options state another number of limits.
+    A channel that never moves gets a narrow range. Raises UserError where the options state another number of limits,
+    or one that is not below the other.
     """
     for key, given in zip(("action_min", "action_max"), stated, strict=True):
         if given is not None and len(given) != len(action):
@@ -138,6 +156,12 @@ def action_range(
     low, high = (
         given if given is not None else found for given, found in zip(stated, (low, high), strict=True)
     )
+    for name, one, other in zip(action, low, high, strict=True):
+        if not one < other:
+            raise UserError(
+                f"{where}.action_min must be below {where}.action_max for each action, found {one:g} and {other:g} for "
+                f"{name}: correct them; null takes the least and greatest values in the data."
+            )
     return tuple(map(float, low)), tuple(map(float, high))
 
 

@@ -22,6 +22,13 @@ from imfvla.errors import UserError
         (["+seed=3"], r"seed exists already: write seed=\.\.\. without a plus sign"),
         (["training.steps"], r"Cannot read the override 'training\.steps': wanted key=value"),
         (["observation.views=[front"], r"Cannot read the override"),
+        (["encoder=[1]"], r"encoder must be one of its files, found the list \[1\]: write encoder=NAME"),
+        (["task=[socket,transfer]"], r"task must be one of its files, .* -m with task=A,B"),
+        (
+            ["horizon=[1]"],
+            r"^horizon must be a mapping of keys to values, found a list: write it as in .*conf\.",
+        ),
+        (["observation.views={front: 1}"], r"^observation\.views must be a list, found a mapping"),
     ],
 )
 def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message):

@@ -10,7 +10,8 @@ import tiny_sweep
 
 from imfvla.command.completion import is_complete
 from imfvla.command.composition import CONFIG_DIRECTORY
-from imfvla.command.sweep import Planned, _Sweep, jobs_of_rows, waves
+from imfvla.command.planning import Planned, jobs_of_rows
+from imfvla.command.sweep import _Sweep, waves
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.rows import untimed
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory

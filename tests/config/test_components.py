@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import tiny_sweep
 
+from imfvla.command.composition import compose
 from imfvla.config import components
 from imfvla.config.construction import allowed_class, construct
 from imfvla.environments import environment_of
@@ -147,6 +148,11 @@ def test_arguments_are_checked_and_a_contract_is_held(mark):
         UserError, match=r"demos must offer what .*EpisodeSource says, found .*Part, which lacks robot"
     ):
         construct({"_target_": "outside_parts.Part", "size": 1}, "demos", EpisodeSource)
+
+
+def test_null_for_what_must_be_given_is_named():
+    with pytest.raises(UserError, match=r"generator\.times must be given, as in .*conf, found None"):
+        construct(compose("train", ["generator.times=null"])["generator"], "generator")
 
 
 def test_a_task_its_data_and_a_generator_of_another_package_are_trained_and_evaluated(installed, tmp_path):

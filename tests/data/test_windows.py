@@ -105,9 +105,7 @@ def test_sparse_frames_decide_where_they_are(sparse):
 
 
 def test_sparse_frames_cannot_serve_two_consecutive_observations(sparse):
-    with pytest.raises(
-        UserError, match=r"horizon\.obs=2 .* collect with camera_every=1, or set horizon\.obs=1"
-    ):
+    with pytest.raises(UserError, match=r"horizon\.obs=2 .* set demos.camera_every=1, or horizon\.obs=1"):
         Windows(sparse, Horizon(2, 4, 2), ROBOT)
 
 

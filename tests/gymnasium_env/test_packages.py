@@ -52,6 +52,16 @@ def install(tmp_path, monkeypatch):
             del gymnasium.registry[found]
 
 
+def test_a_version_is_that_of_the_distribution_whatever_its_name(install, tmp_path):
+    install("slides_here", "__root__ = slides_here:register_envs")
+    assert packages.version_of("slides_here") == "slides_here 1.2"
+    (tmp_path / "slides_here-1.2.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: My-Robot\nVersion: 3.4\n"
+    )
+    assert packages.version_of("slides_here") == "slides_here 3.4"
+    assert packages.version_of("nowhere_at_all") == "nowhere_at_all"
+
+
 def test_other_packages_are_not_imported(monkeypatch):
     monkeypatch.delitem(sys.modules, "this", raising=False)
     with pytest.raises(UserError, match="nothing else is imported"):

@@ -216,7 +216,18 @@ def test_bad_files_are_refused_by_file_and_key(tmp_path, damage, words):
         ({"state": {"eef_pos": ["x", "y"]}}, ["demos.state.eef_pos", "unit", "'x'"]),
         ({"state": {"eef_pos": ["x [m]"]}}, ["obs/eef_pos", "(steps, 1)", "(6, 2)"]),
         ({"state": {"eef_vel": ["x [m]"]}}, ["obs", "eef_vel", "eef_pos"]),
-        ({"action": ["x [m]", "y [m]", "y [m]"]}, ["robot.action", "differ"]),
+        ({"action": ["x [m]", "y [m]", "y [m]"]}, ["demos.action", "differ", "y more than once"]),
+        (
+            {"state": {"eef_pos": ["x [m]", "y [m]"], "gripper_qpos": ["x [m]"]}},
+            ["demos.state", "x more than once"],
+        ),
+        ({"state": {"eef_pos": ["x [m]", 3]}}, ["demos.state", "names of channels"]),
+        ({"cameras": {"eye": ["agentview_image"]}}, ["demos.cameras.eye", "a text"]),
+        ({"instruction": " "}, ["demos.instruction", "a sentence"]),
+        (
+            {"action_min": [0, 0, 0], "action_max": [1, 0, 1]},
+            ["demos.action_min", "demos.action_max", "0 and 0 for y"],
+        ),
         ({"action_key": "actions_rel"}, ["demo_0", "actions_rel", "actions_abs"]),
         ({"cameras": {"eye": "wrist"}}, ["obs", "wrist", "agentview_image"]),
         ({"cameras": {"eye": "eef_pos"}}, ["eef_pos", "uint8"]),
@@ -229,6 +240,24 @@ def test_options_that_do_not_fit_are_refused_by_key(tmp_path, changes, words):
     path = write_robomimic(tmp_path / "demo.hdf5")
     with pytest.raises(UserError) as error:
         robomimic(path, **changes).episode(0) if "path" not in changes else robomimic(**changes)
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (set_values("data/demo_10/obs/eef_pos", np.zeros((6, 4))), ["demo_10/obs/eef_pos", "(steps, 2)", "(6, 4)"]),
+        (set_values("data/demo_10/obs/eef_pos", np.zeros((4, 2))), ["demo_10/obs/eef_pos", "6 steps", "(4,)"]),
+        (set_values("data/demo_10/obs", 3), ["demo_10/obs", "a group"]),
+        (set_values("data/demo_10/obs/agentview_image", np.zeros((9, *SMALL, 3), "u1")), ["agentview", "6 steps"]),
+    ],
+)  # fmt: skip
+def test_keys_and_shapes_of_every_episode_are_checked_before_one_is_read(tmp_path, damage, words):
+    """So that a training, which opens its source first, has not begun."""
+    path = write_robomimic(tmp_path / "demo.hdf5")
+    damage(path)
+    with pytest.raises(UserError) as error:
+        robomimic(path)
     assert all(word in str(error.value) for word in words), str(error.value)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, write_demonstrations, write_episode
 
 from imfvla.command.composition import compose
@@ -56,6 +57,20 @@ def test_an_unknown_source_or_option_is_named(synthetic_demonstrations):
         opening.open_source(config | {"demos": config["demos"] | {"source": "tape"}})
     with pytest.raises(UserError, match=r"Unknown key demos\.folder"):
         mcap.open_source({"path": "x", "folder": "y"})
+
+
+def test_a_file_of_another_program_is_not_called_damaged(tmp_path):
+    with (tmp_path / "bag.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/joint_states", "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(
+        UserError, match=r"bag\.mcap is no episode of imfvla: .*imfvla\.episode.*demos=ros2"
+    ) as error:
+        McapSource.of(tmp_path)
+    assert "damaged" not in str(error.value)
 
 
 def test_a_folder_without_recordings_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """The grammar of run directories: what names one, and that every reader takes from the name what the writer put in."""
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -31,6 +32,19 @@ OVERRIDES = st.lists(st.one_of(st.builds("{}={}".format, WORDS, WORDS), WORDS, L
 )
 def test_run_names(overrides, name):
     assert run_name(overrides) == name
+
+
+def test_long_options_of_a_source_are_a_digest_behind_its_name():
+    """So that the rest of the name can be read, and every other option is another run."""
+    options = ["demos.path=data/bags", "demos.control_hz=20", "demos.instruction=pick up the red block"]
+    name = run_name(["task=none", "demos=ros2", *options, "seed=1", "training.steps=9"])
+    assert re.fullmatch(r"demos=ros2-[0-9a-f]{8},seed=1,task=none,training\.steps=9", name)
+    assert run_name(["task=none", "demos=ros2", *reversed(options), "seed=1", "training.steps=9"]) == name
+    changed = run_name(["task=none", "demos=ros2", *options[:2], "demos.instruction=pick up the red cube"])
+    assert changed.startswith("demos=ros2-")
+    assert changed.split(",")[0] not in name
+    assert re.fullmatch(r"demos=[0-9a-f]{8}", run_name(options))  # chosen by an experiment
+    assert run_name(["demos=lerobot", "demos.path=data/aloha"]) == "demos.path=data-aloha,demos=lerobot"
 
 
 def test_long_run_names_are_cut_and_stay_apart():

@@ -13,7 +13,7 @@ import pytest
 import synthetic_runs
 import yaml
 
-from imfvla.command.sweep import jobs_of_rows
+from imfvla.command.planning import jobs_of_rows
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import read_mapping
 from imfvla.storage.files import write_json

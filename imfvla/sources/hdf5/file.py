@@ -96,8 +96,8 @@ def _name(parent: h5py.Group, key: str) -> str:
     return f"{parent.name.rstrip('/')}/{key}"
 
 
-def read_numbers(data: h5py.Dataset, names: Sequence[str], path: Path) -> np.ndarray:
-    """float32 (T, channels). Raises UserError where the shape or type is another, and on NaN."""
+def numbers_shape(data: h5py.Dataset, names: Sequence[str], path: Path) -> tuple[int, int]:
+    """(T, channels), without reading a value. Raises UserError where the shape or type is another."""
     if data.dtype.kind not in "fiub":
         raise misfit(path, data.name, "numbers (objects are not supported)", str(data.dtype), CHOOSE)
     shape = data.shape if data.ndim != 1 else (*data.shape, 1)
@@ -108,6 +108,12 @@ def read_numbers(data: h5py.Dataset, names: Sequence[str], path: Path) -> np.nda
         )  # fmt: skip
     if data.size * data.dtype.itemsize > MAX_EPISODE_BYTES:
         raise misfit(path, data.name, f"at most {MAX_EPISODE_BYTES} bytes", data.shape, "split the episode")
+    return shape
+
+
+def read_numbers(data: h5py.Dataset, names: Sequence[str], path: Path) -> np.ndarray:
+    """float32 (T, channels). Raises UserError where the shape or type is another, and on NaN."""
+    shape = numbers_shape(data, names, path)
     return numbers(data[()].reshape(shape), len(names), path, data.name, names)
 
 

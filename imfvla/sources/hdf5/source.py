@@ -15,18 +15,22 @@ from imfvla.robot import MAX_CONTROL_HZ, Camera, RobotSpec
 from imfvla.sources.base import EpisodeArrays
 from imfvla.sources.checks import (
     MAX_EPISODES,
+    SENTENCE,
     action_range,
     channels,
     chosen_episodes,
     digest_of,
     displaced,
+    documented,
     misfit,
+    refuse_repeated,
     shortened,
 )
 from imfvla.sources.hdf5.file import (
     dataset,
     group,
     is_pictures,
+    numbers_shape,
     opened,
     picture_size,
     read_numbers,
@@ -64,13 +68,13 @@ class Options:
     state: Any  # key -> names of channels
     action: tuple[str, ...]
     action_key: str | None
-    cameras: Any  # view -> key, or null
+    cameras: Mapping[str, str] | None  # view -> key
     picture_order: Annotated[str, one_of("rgb", "bgr")]
     absolute: tuple[str, ...] | None
     action_min: tuple[float, ...] | None
     action_max: tuple[float, ...] | None
     camera_every: Annotated[int, at_least(1)]
-    instruction: Annotated[str, Limit("a sentence", bool)]
+    instruction: Annotated[str, SENTENCE]
 
 
 class Hdf5Source:
@@ -87,9 +91,10 @@ class Hdf5Source:
         self._places_chosen = [
             places[number] for number in chosen_episodes(options.episodes, len(places), options.path, where)
         ]
+        names = tuple(name for part in self._state.values() for name in part)
+        refuse_repeated(names, f"{where}.state")
         self._cameras, sizes = self._chosen_cameras()
         self._lengths, seen = self._surveyed()
-        names = tuple(name for part in self._state.values() for name in part)
         stated = (options.action_min, options.action_max)
         low, high = action_range(self._action, stated, seen, where)
         self.robot = RobotSpec(
@@ -163,24 +168,14 @@ class Hdf5Source:
         """View -> key, and view -> (H, W) in the first episode: those of the options, else all that look like one."""
         path, name = self._places_chosen[0]
         views = self._options.cameras
-        fits = views is None or (
-            isinstance(views, Mapping) and all(isinstance(key, str) for key in views.values())
-        )
-        if not fits:
-            raise UserError(
-                f"{self._where}.cameras must be null or a mapping of views to keys, found {shortened(views)}."
-            )
         with opened(path) as file:
             parent = _episode_group(file, name, path)
             if views is None:
                 views = {key: key for key in self._like_cameras(parent, path)}
             data = {
-                str(view): dataset(parent, f"{self._layout.cameras}/{key}", path)
-                for view, key in views.items()
+                view: dataset(parent, f"{self._layout.cameras}/{key}", path) for view, key in views.items()
             }
-            return {str(view): key for view, key in views.items()}, {
-                view: picture_size(found, path) for view, found in data.items()
-            }
+            return dict(views), {view: picture_size(found, path) for view, found in data.items()}
 
     def _like_cameras(self, parent: h5py.Group, path: Path) -> list[str]:
         """Keys of the pictures of an episode; ACT's may have no cameras at all."""
@@ -195,12 +190,23 @@ class Hdf5Source:
         return [key for key, found in data.items() if found.ndim in dimensions and is_pictures(found)]
 
     def _surveyed(self) -> tuple[list[int], tuple[np.ndarray, np.ndarray]]:
-        """Steps of each episode, and the range of all actions, which are read only where no options state it."""
+        """Steps of each episode, and the range of all actions, which are read only where no options state it.
+
+        Raises UserError where an episode lacks a key, or has another shape or length there.
+        """
         lengths, lows, highs = [], [np.full(len(self._action), np.inf)], [np.full(len(self._action), -np.inf)]
         is_stated = None not in (self._options.action_min, self._options.action_max)
         for path, name in self._places_chosen:
             with opened(path) as file:
-                data = self._action_data(_episode_group(file, name, path), path)
+                parent = _episode_group(file, name, path)
+                data = self._action_data(parent, path)
+                numbers_shape(data, self._action, path)
+                for key, names in self._state.items():
+                    state = dataset(parent, f"{self._layout.state}/{key}", path)
+                    numbers_shape(state, names, path)
+                    _same_length(state, len(data), path)
+                for key in self._cameras.values():
+                    _same_length(dataset(parent, f"{self._layout.cameras}/{key}", path), len(data), path)
                 if not is_stated or not lengths:
                     action = read_numbers(data, self._action, path)
                     lows.append(action.min(0))
@@ -236,7 +242,7 @@ def _state(parts: Any, key: str) -> dict[str, tuple[str, ...]]:
     if not fits or not all(isinstance(name, str) for names in parts.values() for name in names):
         raise UserError(
             f"{key} must be a mapping of keys to names of channels, found {shortened(parts)}: an HDF5 file has none, "
-            "see conf/demos/hdf5.yaml."
+            f"{documented('hdf5')}."
         )
     return {str(name): channels(names, f"{key}.{name}", need_units=True) for name, names in parts.items()}
 

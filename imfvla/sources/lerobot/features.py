@@ -10,7 +10,7 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.options import Limit, at_least, some
 from imfvla.robot import Camera, RobotSpec, bare_name
-from imfvla.sources.checks import action_range, channels, displaced, misfit
+from imfvla.sources.checks import SENTENCE, action_range, channels, displaced, misfit, refuse_repeated
 from imfvla.sources.lerobot.layout import DOWNLOAD, NUMERIC, ROBOT, STATS, Feature, Info
 from imfvla.storage.documents import read_json
 
@@ -27,14 +27,14 @@ class Options:
     episodes: tuple[Annotated[int, at_least(0)], ...] | None
     state: Annotated[tuple[str, ...], NAMES]
     action: Annotated[tuple[str, ...], NAMES]
-    cameras: Any  # a mapping view -> feature, or null for all
+    cameras: Mapping[str, str] | None  # view -> feature; null: all
     state_names: tuple[str, ...] | None
     action_names: tuple[str, ...] | None
     absolute: tuple[str, ...] | None
     action_min: tuple[float, ...] | None
     action_max: tuple[float, ...] | None
     camera_every: Annotated[int, at_least(1)]
-    instruction: str | None
+    instruction: Annotated[str, SENTENCE] | None
 
 
 def chosen(info: Info, keys: Sequence[str], where: str) -> list[Feature]:
@@ -51,7 +51,7 @@ def chosen(info: Info, keys: Sequence[str], where: str) -> list[Feature]:
     return [info.features[key] for key in keys]
 
 
-def chosen_cameras(info: Info, views: Any, where: str) -> dict[str, Feature]:
+def chosen_cameras(info: Info, views: Mapping[str, str] | None, where: str) -> dict[str, Feature]:
     """View -> feature: as `views` maps them, or all colour cameras where it is None."""
     known = {key: feature for key, feature in info.features.items() if feature.is_camera}
     if views is None:
@@ -59,15 +59,13 @@ def chosen_cameras(info: Info, views: Any, where: str) -> dict[str, Feature]:
         short = {key: key.removeprefix(PREFIX).rpartition(".")[2] for key in colour}
         is_unique = len(set(short.values())) == len(short)
         return {short[key] if is_unique else key: feature for key, feature in colour.items()}
-    if not isinstance(views, Mapping):
-        raise UserError(f"{where}.cameras must be null or a mapping of views to features, found {views!r}.")
     for view, name in views.items():
         if name not in known:
             raise UserError(
                 f"{where}.cameras.{view} must be one of {', '.join(known) or 'none'}, found {name!r}: "
                 f"choose a camera of {info.path}."
             )
-    return {str(view): known[name] for view, name in views.items()}
+    return {view: known[name] for view, name in views.items()}
 
 
 def robot_of(
@@ -115,6 +113,7 @@ def _names(features: Sequence[Feature], given: tuple[str, ...] | None, key: str)
     names = [name for _, name in pairs]
     if len(set(map(bare_name, names))) < len(names):
         names = [f"{feature.key}/{name}" for feature, name in pairs]
+        refuse_repeated([feature.key for feature in features], key.removesuffix("_names"))
     return channels(names, key, need_units=False)
 
 

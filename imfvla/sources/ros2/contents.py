@@ -79,6 +79,7 @@ def read_bag(
             raise part.unfit(message)
     missing = [part.topic for part in wanted.parts if not values[part][0]]
     missing += [topic for view, topic in wanted.cameras.items() if not times[view]]
+    missing += [topic for topic, said in texts.items() if not said]
     if missing:
         known = shortened(
             ", ".join(f"{topic} ({kind})" for topic, kind in topics_of(bag).items()) or "none", 600

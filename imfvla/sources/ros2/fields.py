@@ -12,7 +12,7 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of
 from imfvla.recording.pictures import MAX_PIXELS, decode
-from imfvla.sources.checks import channels, shortened
+from imfvla.sources.checks import channels, documented, shortened
 from imfvla.sources.ros2.bag import Received
 
 JOINT_FIELDS = ("position", "velocity", "effort")
@@ -57,7 +57,7 @@ class Part:
         if not all(isinstance(name, str) for name in names):
             raise UserError(
                 f"{where}.channels must be a mapping of joints to names of channels, or a list of names, "
-                f"found {shortened(entry.channels)}: see conf/demos/ros2.yaml."
+                f"found {shortened(entry.channels)}: {documented('ros2')}."
             )
         return cls(entry.topic, entry.field, keys, channels(names, f"{where}.channels", need_units=True))
 
@@ -84,6 +84,14 @@ class Part:
     def unfit(self, message: Received) -> UserError:
         """The error for a message that has other fields than these channels."""
         found = self._found(message.decode()) or _fields(message.decode())
+        if self.keys[:1] == (0,):  # a list of channels takes an array in order
+            is_array = hasattr(message.decode(), "data")
+            remedy = "correct the list" if is_array else "write a mapping of joints or fields to channels"
+            found = f"{len(found)} numbers" if is_array else shortened(", ".join(map(str, found)))
+            return UserError(
+                f"{message.file}: {message.kind} of {self.topic} must have an array of {len(self.keys)} numbers, as "
+                f"many as the list has channels, found {found}; {remedy} in the options."
+            )
         return UserError(
             f"{message.file}: {message.kind} of {self.topic} must have {self.field} "
             f"{shortened(', '.join(map(str, self.keys)))}, found {shortened(', '.join(map(str, found)))}; "

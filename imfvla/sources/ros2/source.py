@@ -17,12 +17,13 @@ from imfvla.sources.checks import (
     chosen_episodes,
     digest_of,
     displaced,
+    refuse_repeated,
     shortened,
 )
 from imfvla.sources.ros2.bag import Bag, find_bags
 from imfvla.sources.ros2.contents import Contents, Wanted, read_bag
 from imfvla.sources.ros2.fields import Part
-from imfvla.sources.ros2.options import Marks, Options, read_cameras, read_parts, read_paths
+from imfvla.sources.ros2.options import Marks, Options, read_parts, read_paths
 from imfvla.sources.ros2.resample import Steps, common_steps, largest_gap_s, last_before, nearest
 
 log = logging.getLogger(__name__)
@@ -49,11 +50,11 @@ class Ros2Source:
         self._options, self._where = options, where
         self._state = read_parts(options.state, f"{where}.state")
         self._action = None if options.action is None else read_parts(options.action, f"{where}.action")
-        self._marks = None if options.marks is None else build(Marks, options.marks, f"{where}.marks")
+        self._marks = options.marks
         texts = (options.instruction_topic, self._marks and self._marks.topic)
         self._wanted = Wanted(
             tuple(dict.fromkeys((*self._state, *(self._action or ())))),
-            read_cameras(options.cameras, where),
+            options.cameras,
             tuple(dict.fromkeys(topic for topic in texts if topic)),
             options.clock == "stamp",
         )
@@ -200,6 +201,8 @@ class Ros2Source:
         options, where = self._options, self._where
         state = [name for part in self._state for name in part.names]
         action = state if self._action is None else [name for part in self._action for name in part.names]
+        refuse_repeated(state, f"{where}.state")
+        refuse_repeated(action, f"{where}.action")
         relative_to = displaced(state, action, options.absolute, where)
         ranges = [plan.action_range for plan in self._plans]
         seen = np.min([low for low, _ in ranges], 0), np.max([high for _, high in ranges], 0)
