@@ -31,6 +31,7 @@ REMEDIES = {
     errno.ESTALE: _DEVICE,
     errno.EMFILE: "no file handle is left; raise the limit with ulimit -n 4096",
     errno.ENFILE: "no file handle is left; stop other programs",
+    errno.ENOMEM: "memory has run out; choose fewer workers=... or a smaller batch",
 }
 WHERE_MISSING = {errno.ENOENT: "check that its parent directories exist"}
 

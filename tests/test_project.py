@@ -116,7 +116,7 @@ ONLY = {
     "generators": "errors nn options",
     "nn": "errors options storage",
     "reporting": "config episode errors options process robot storage",
-    "storage": "config errors options",
+    "storage": "config errors options process",
 }
 SIMULATE = "tasks gymnasium_env"
 WHO_MAY = {  # of the heavy packages

@@ -44,10 +44,12 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "tests"), str(ROOT / "tests" / "training")]
 from faults.changes import changes  # noqa: E402
 from faults.disk import disk  # noqa: E402
+from faults.fuse import fuse  # noqa: E402
 from faults.killing import kills_of  # noqa: E402
 from faults.leftovers import leftovers  # noqa: E402
 from faults.outcome import Differs, demonstrations_of, rows_of, state_of  # noqa: E402
 from faults.sharing import nfs, no_locks, publications  # noqa: E402
+from faults.space import space  # noqa: E402
 from faults.stops import stops  # noqa: E402
 from faults.strangers import strangers  # noqa: E402
 from faults.sweep import sweep  # noqa: E402
@@ -63,6 +65,7 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "torchrun": torchrun,
     "stops": stops,
     "disk": disk,
+    "space": space,
     "workers": workers,
     "changes": changes,
     "leftovers": leftovers,
@@ -70,6 +73,7 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "publications": publications,
     "no_locks": no_locks,
     "nfs": nfs,
+    "fuse": fuse,
 }
 
 

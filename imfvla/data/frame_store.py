@@ -225,8 +225,8 @@ def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progre
 
 
 def _names(store_path: Path) -> set[str]:
-    """The files of a store, without those that NFS keeps while a process has them open."""
-    return {name for name in os.listdir(store_path) if not name.startswith(".nfs")}
+    """The files of a store, without those that NFS and FUSE keep while a process has them open."""
+    return {name for name in os.listdir(store_path) if not name.startswith((".nfs", ".fuse_hidden"))}
 
 
 def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:

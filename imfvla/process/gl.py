@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from imfvla.errors import UserError
+from imfvla.process.running_time import run
 
 SIMULATORS = ("mujoco", "dm_control")  # they read MUJOCO_GL when they are imported
 BACKENDS = ("egl", "osmesa", "glfw", "cgl", "wgl")
@@ -126,9 +127,7 @@ def _probe(backend: str) -> Probed:
     """Asks `gl_probe` in a process of its own; one that hangs or dies has a backend that does not draw."""
     program = Path(__file__).with_name("gl_probe.py")
     try:
-        child = subprocess.run(
-            [sys.executable, "-I", str(program), backend], capture_output=True, timeout=PROBE_TIMEOUT_S
-        )
+        child = run([sys.executable, "-I", str(program), backend], PROBE_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         return Probed(problem=f"no answer within {PROBE_TIMEOUT_S:g} s")
     if child.returncode != 0:

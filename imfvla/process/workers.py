@@ -10,7 +10,6 @@ import os
 import signal
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -20,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from imfvla.errors import UserError
+from imfvla.process.running_time import TICK_S, RunningTime
 from imfvla.process.signals import held_back, ignore_stops
 
 MAX_ATTEMPTS = 3  # of one call: what kills three workers kills the next one too
@@ -47,14 +47,15 @@ class Pool:
         waiting = list(enumerate(calls))[::-1]
         attempts = [0] * len(calls)
         busy: dict[_Worker, tuple[int, tuple[Any, ...], float]] = {}
+        passed = RunningTime()
         try:
             while waiting or busy:
                 for worker in [worker for worker in self._workers if worker not in busy][: len(waiting)]:
                     number, arguments = waiting.pop()
                     attempts[number] += 1
                     worker.send(function, arguments)
-                    busy[worker] = (number, arguments, time.monotonic())
-                for worker, outcome in self._outcomes(busy):
+                    busy[worker] = (number, arguments, passed())
+                for worker, outcome in self._outcomes(busy, passed):
                     number, arguments, _ = busy.pop(worker)
                     if isinstance(outcome, _Lost):
                         self._replace(worker, outcome, attempts[number])
@@ -68,18 +69,15 @@ class Pool:
             for worker in busy:  # the caller stopped reading: nobody needs the results
                 self._workers[self._workers.index(worker)] = _Worker(after=worker)
 
-    def _outcomes(self, busy: dict["_Worker", Any]) -> list[tuple["_Worker", Any]]:
+    def _outcomes(self, busy: dict["_Worker", Any], passed: RunningTime) -> list[tuple["_Worker", Any]]:
         """The outcomes of the calls under way: waits for at least one result or loss."""
         while True:
-            timeout = None
-            if self._timeout_s is not None:
-                oldest = min(began for _, _, began in busy.values())
-                timeout = max(0.0, oldest + self._timeout_s - time.monotonic())
+            timeout = None if self._timeout_s is None else TICK_S
             ready = connection.wait([worker.connection for worker in busy], timeout)
             found = [(worker, worker.receive()) for worker in busy if worker.connection in ready]
             if found:
                 return found
-            late = time.monotonic() - (self._timeout_s or 0.0)
+            late = passed() - (self._timeout_s or 0.0)
             hanging = _Lost(
                 f"gave no answer within {self._timeout_s:g} s",
                 "if a graphics driver hangs, try export MUJOCO_GL=osmesa",

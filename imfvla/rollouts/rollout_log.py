@@ -15,6 +15,7 @@ from imfvla.reporting.recomputed import DIGEST as EPISODES_DIGEST
 from imfvla.reporting.recomputed import EPISODES, digest_of, recomputed
 from imfvla.reporting.records import Row
 from imfvla.reporting.runs import read_summary
+from imfvla.storage.appended import AppendedFile
 from imfvla.storage.documents import parse_json, read_text
 from imfvla.storage.files import (
     clear_write_errors,
@@ -26,7 +27,7 @@ from imfvla.storage.files import (
     write_text,
 )
 from imfvla.storage.fingerprint import code_version
-from imfvla.storage.opening import ROWS, open_to_append
+from imfvla.storage.opening import ROWS
 from imfvla.storage.trained_config import DIGEST
 
 log = logging.getLogger(__name__)
@@ -80,10 +81,8 @@ class RolloutLog:
 
     def append(self, row: Row) -> None:
         """Adds a row and forces it to disk at once."""
-        with clear_write_errors(self._partial):
-            self._stream.write(dump_row(row))
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
+        self._stream.write(dump_row(row).encode("utf-8"))
+        self._stream.sync()
         self.rows.append(dict(row))
 
     def finish(self, rows: Iterable[Row], summary: Mapping[str, Any]) -> None:
@@ -144,8 +143,7 @@ class RolloutLog:
             log.warning("%s is damaged or of another %s: starting over.", self._partial, ", ".join(keys))
         text = json.dumps(header) + "\n" + "".join(dump_row(row) for row in self.rows)
         write_text(self._partial, text)
-        with clear_write_errors(self._partial):
-            self._stream = open_to_append(self._partial)
+        self._stream = AppendedFile(self._partial)
 
     def _left(self) -> list[str]:
         """The lines of an interrupted evaluation."""

@@ -4,17 +4,18 @@ import hashlib
 import os
 import stat
 import subprocess
-import time
 from pathlib import Path
 
-TIMEOUT_S = 10  # of git, and of reading what it lists
+from imfvla.process.running_time import run
+
+TIMEOUT_S = 30  # of git
 MAX_BYTES = 64 * 2**20  # read of all files together
 # Kept results lie in the repository, but no result depends on them; a campaign adds to them while it runs.
 NOT_CODE = ("experiments/results", "experiments/pretrained")
 
 
 def commit_of(root: Path) -> str | None:
-    """The commit of a clone, None where git or the clone is missing."""
+    """The commit of a clone, None where git or the clone is missing. Raises OSError as below."""
     found = _git(root, "rev-parse", "HEAD")
     return None if found is None else found.decode().strip() or None
 
@@ -22,8 +23,8 @@ def commit_of(root: Path) -> str | None:
 def changes_since_commit(root: Path) -> str | None:
     """16 hex digits of the files that differ from the commit of a clone, "" where none does, None without git.
 
-    Counts changed, deleted and new files that git does not ignore, by path, mode and content. Files beyond 64 MiB or
-    10 s count by size and time of change.
+    Counts changed, deleted and new files that git does not ignore, by path, mode and content. Files beyond 64 MiB
+    count by size and time of change. Raises OSError where git cannot be started, for lack of file handles for example.
     """
     excluded = (f":(exclude,top){folder}" for folder in NOT_CODE)
     listed = _git(
@@ -34,10 +35,10 @@ def changes_since_commit(root: Path) -> str | None:
     entries = sorted(entry[3:] for entry in listed.split(b"\0") if entry)
     if not entries:
         return ""
-    digest, left, deadline = hashlib.sha256(), MAX_BYTES, time.monotonic() + TIMEOUT_S
+    digest, left = hashlib.sha256(), MAX_BYTES
     for name in entries:
         path = Path(root, os.fsdecode(name))
-        content, read = _content(path, left if time.monotonic() < deadline else 0)
+        content, read = _content(path, left)
         left -= read
         for part in (name, content):
             digest.update(len(part).to_bytes(8, "big") + part)
@@ -64,15 +65,10 @@ def _content(path: Path, limit: int) -> tuple[bytes, int]:
 
 
 def _git(root: Path, *arguments: str) -> bytes | None:
-    """The output of git, which writes nothing; None where it fails."""
+    """The output of git, which writes nothing; None where it is missing or fails."""
+    command = ["git", "-C", str(root), *arguments]
     try:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments],
-            capture_output=True,
-            env=os.environ | {"GIT_OPTIONAL_LOCKS": "0"},
-            timeout=TIMEOUT_S,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
+        done = run(command, TIMEOUT_S, env=os.environ | {"GIT_OPTIONAL_LOCKS": "0"})
+    except (FileNotFoundError, PermissionError, subprocess.TimeoutExpired):
         return None
-    return done.stdout
+    return None if done.returncode else done.stdout

@@ -1,17 +1,15 @@
 """Metrics of a training run: one row of means per interval in metrics.jsonl, and the same in TensorBoard."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
-
-from imfvla.storage.files import clear_write_errors, make_folder, sync, write_text
+from imfvla.storage.appended import AppendedFile
+from imfvla.storage.files import write_text
 from imfvla.storage.metrics import read_metrics
-from imfvla.storage.opening import open_to_append
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.training.tensorboard import EventFile
 
 
 class MetricsLogger:
@@ -22,14 +20,9 @@ class MetricsLogger:
     """
 
     def __init__(self, run: RunDirectory, resumed_step: int, state: Mapping[str, Any] | None = None) -> None:
-        self._path = run.metrics
-        _truncate(self._path, resumed_step)
-        with clear_write_errors(self._path):
-            make_folder(self._path.parent)
-            self._file = open_to_append(self._path)
-            sync(self._path.parent)
-        with clear_write_errors(run.tensorboard):
-            self._tensorboard = SummaryWriter(str(run.tensorboard), purge_step=resumed_step + 1)
+        _truncate(run.metrics, resumed_step)
+        self._file = AppendedFile(run.metrics)
+        self._events = EventFile(run.tensorboard, resumed_step + 1)
         self._sums: dict[str, float] = dict(state["sums"]) if state else {}
         self._count: int = state.get("count", 0) if state else 0
         self._skipped: int = state.get("skipped", 0) if state else 0
@@ -49,27 +42,22 @@ class MetricsLogger:
         row = {name: total / self._count for name, total in self._sums.items()} | extra
         if self._skipped:
             row["skipped"] = self._skipped
-        with clear_write_errors(self._path):
-            self._file.write(json.dumps({"step": step, **row}) + "\n")
-            self._file.flush()
-            for name, value in row.items():
-                self._tensorboard.add_scalar(name, value, step)
+        self._file.write((json.dumps({"step": step, **row}) + "\n").encode("utf-8"))
+        self._events.add(row, step)
         self._sums, self._count, self._skipped = {}, 0, 0
 
     def sync(self) -> None:
         """Forces the rows to disk, before a state counts that follows them. TensorBoard's files are left out."""
-        with clear_write_errors(self._path):
-            os.fsync(self._file.fileno())
+        self._file.sync()
 
     def state(self) -> dict[str, Any]:
         """Sums of the interval that has begun; JSON-able."""
         return {"sums": dict(self._sums), "count": self._count, "skipped": self._skipped}
 
     def close(self) -> None:
-        with clear_write_errors(self._path):
-            os.fsync(self._file.fileno())
-            self._file.close()
-            self._tensorboard.close()
+        self._file.sync()
+        self._file.close()
+        self._events.close()
 
 
 class SilentLogger(MetricsLogger):

@@ -1,5 +1,6 @@
 """What counts as a change of a clone, and which changes are told apart."""
 
+import errno
 import os
 import subprocess
 from pathlib import Path
@@ -70,3 +71,12 @@ def test_without_git_nothing_is_known(tmp_path, monkeypatch):
     assert commit_of(tmp_path) is None
     monkeypatch.setenv("PATH", str(tmp_path))
     assert changes_since_commit(tmp_path) is None
+
+
+def test_a_git_that_cannot_be_started_is_not_taken_for_other_code(clone, monkeypatch):
+    def exhausted(*_, **__):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(subprocess, "Popen", exhausted)
+    with pytest.raises(OSError, match="Too many open files"):
+        commit_of(clone)

@@ -97,8 +97,9 @@ def kill_over(
     while True:
         left_over = half_written(folder)  # by earlier kills
         child, began_at = start(work, folder), progress_of(folder)
-        left = int(0.9 * amount) - began_at  # so that the last kill does not come after the end
-        goal = began_at + rng.randint(0, max(0, 2 * left // max(1, kills - done) - 1))
+        last = int(0.9 * amount)  # the last kill must not come after the end
+        goal = began_at + rng.randint(0, max(0, 2 * (last - began_at) // max(1, kills - done) - 1))
+        goal = min(goal, last)
         while (code := ended(child)) is None:
             if done < kills and progress_of(folder) >= goal:
                 deadline = time.monotonic() + 2.0

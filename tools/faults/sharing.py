@@ -5,6 +5,8 @@ import fcntl
 import os
 import random
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -89,8 +91,7 @@ def without_locks(work: partial, place: Path) -> None:
 
 def nfs(folder: Path, kills: int, rng: random.Random) -> str:
     """Frame stores replaced while a process has them open, where open files cannot be deleted, as on NFS."""
-    source = McapSource.of(write_demonstrations(folder / "demos", num_episodes=2, num_steps=6))
-    store, numbers, original = folder / "store", count(), os.unlink
+    numbers, original = count(), os.unlink
 
     def keep(path: str | Path, *, dir_fd: int | None = None) -> None:
         """NFS renames a file that is open instead of deleting it: here all that `shutil.rmtree` deletes."""
@@ -100,16 +101,27 @@ def nfs(folder: Path, kills: int, rng: random.Random) -> str:
         elif not str(path).startswith(".nfs"):
             os.rename(path, kept, src_dir_fd=dir_fd, dst_dir_fd=dir_fd)
 
-    turns = max(2, kills // 5)
+    @contextmanager
+    def keeping() -> Iterator[None]:
+        os.unlink = keep
+        try:
+            yield
+        finally:
+            os.unlink = original
+
+    return stores_replaced(folder, max(2, kills // 5), keeping)
+
+
+def stores_replaced(folder: Path, turns: int, keeping: Callable[[], AbstractContextManager[None]]) -> str:
+    """Replaces a store that is in use, each time within `keeping`, which keeps open files that are deleted."""
+    source = McapSource.of(write_demonstrations(folder / "demos", num_episodes=2, num_steps=6))
+    store = folder / "store"
     for turn in range(turns):
         old = FrameStore.build(source, store, (8 + turn, 8), ("front",))
         pixels = old.images.copy()
-        (store / f".nfs{next(numbers):024d}").write_bytes(b"of another process")
-        os.unlink = keep
-        try:
+        (store / f".nfs{turn:024x}").write_bytes(b"of another process")
+        with keeping():
             new = FrameStore.build(source, store, (9 + turn, 8), ("front",))
-        finally:
-            os.unlink = original
         if not np.array_equal(old.images, pixels):
             raise Differs("the pictures of a store in use have changed")
         if new.image_size != (9 + turn, 8) or FrameStore.open(store).image_size != new.image_size:

@@ -69,8 +69,9 @@ def killed_over(folder: Path, kills: int, rng: random.Random) -> list[str]:
         before: set[int] = set()
         for number in range(kills):
             began_at = progress_of(folder / "killed")
-            left = int(0.9 * 2 * STEPS) - began_at
-            goal = began_at + rng.randint(0, max(0, 2 * left // (kills - number) - 1))
+            last = int(0.9 * 2 * STEPS)
+            goal = began_at + rng.randint(0, max(0, 2 * (last - began_at) // (kills - number) - 1))
+            goal = min(goal, last)
             deadline = time.monotonic() + TIMEOUT_S
             while progress_of(folder / "killed") < goal or len(workers_of(run.pid) - before) < 2:
                 if run.poll() is not None:
