@@ -12,7 +12,8 @@ TASK ?= socket
 EPISODES ?= 4
 ARGS ?=
 
-SHIPPED := experiments/pretrained/$(TASK)_ph32_exec16/generator=imf_plain
+SHIPPED_dwell := transfer_dwell/seed=0
+SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/generator=imf_plain)
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
@@ -36,7 +37,7 @@ demos: setup  ## Record the demonstrations of both tasks (ARGS="episodes=200")
 	$(PY) -m imfvla.collect task=socket $(ARGS)
 	$(PY) -m imfvla.collect task=transfer $(ARGS)
 
-eval: setup  ## Roll out the shipped policy, write a video (TASK=socket or transfer, EPISODES=4)
+eval: setup  ## Roll out the shipped policy, write a video (TASK=socket, transfer or dwell, EPISODES=4)
 	$(PY) -m imfvla.evaluate run=$(SHIPPED) episodes=$(EPISODES) nfe=1 $(ARGS)
 	@echo "Videos, and MCAP files for Foxglove beside them:"; ls $(SHIPPED)/rollouts/*/*.mp4
 

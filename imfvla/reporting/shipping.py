@@ -16,7 +16,7 @@ from imfvla.storage.files import clear_write_errors, copy_file, locked, put_fold
 from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
-MAX_BYTES = 8_000_000  # of the weights
+MAX_BYTES = 16_000_000  # of the weights
 THINNING = 10
 TRAIN = ("python", "-m", "imfvla.train")
 RECORDED = ("depth_attention.json",)  # what tools may have added to a run
@@ -27,7 +27,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
 
     It gets config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
     summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
-    weights above 8 MB, no reported evaluation, or a target that exists.
+    weights above 16 MB, no reported evaluation, or a target that exists.
     """
     refuse_existing(target)
     state = run.status().get("state")
