@@ -14,6 +14,7 @@ import numpy as np
 
 from imfvla.command.entry import entry_point
 from imfvla.episode import Actor
+from imfvla.errors import UserError
 from imfvla.options import build, within
 from imfvla.storage.files import write_together
 
@@ -48,6 +49,11 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
     from imfvla import tasks
     from imfvla.figures.contact_sheet import contact_sheet, png
 
+    if task.get("name") not in tasks.NAMES or "expert" not in task:
+        raise UserError(
+            f"task must be one of {', '.join(tasks.NAMES)}, whose experts have a hidden choice to show, found "
+            f"{task.get('name')!r}: an evaluation films other environments."
+        )
     env = tasks.load(task["name"], variant=task["variant"])
     directory.mkdir(parents=True, exist_ok=True)
     paths = []

@@ -2,6 +2,7 @@ import cv2
 import pytest
 
 from imfvla import tasks
+from imfvla.errors import UserError
 from imfvla.figures.contact_sheet import GAP
 from imfvla.gallery import write_gallery
 
@@ -17,3 +18,10 @@ def test_both_ways_of_the_hidden_choice_are_shown_from_one_start(name, tmp_path)
     row = (shape[0] - 24) // 4  # of pictures with its line of text, about
     assert (sheets[0][:row] == sheets[1][:row]).all()
     assert (sheets[0][row : 2 * row] != sheets[1][row : 2 * row]).any()
+
+
+@pytest.mark.parametrize("task", [{"name": "none", "paraphrases": False}, {"name": "pusht", "expert": None}])
+def test_another_task_is_refused_by_name(task, tmp_path):
+    with pytest.raises(UserError, match=rf"task must be one of socket, .* found '{task['name']}'"):
+        write_gallery(task, 0, 24, tmp_path / "out")
+    assert not list(tmp_path.iterdir())

@@ -21,6 +21,7 @@ import numpy as np
 from imfvla.config.protocol import REPORTING_FIRST_SEED
 from imfvla.environments.rollout import run_episode
 from imfvla.episode import EpisodeInfo, EpisodeResult, Step
+from imfvla.errors import UserError
 from imfvla.modes.grippers import grippers_of, release_delay
 from imfvla.process.progress import Progress
 from imfvla.rollouts.actor import ChunkActor
@@ -50,7 +51,12 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=100)
     arguments = parser.parse_args()
     env, policy = load_workbench(arguments.run, RunDirectory(arguments.run).weights_step())
-    taking, giving = grippers_of(env.robot)  # the left hand takes
+    grippers = grippers_of(env.robot)
+    if len(grippers) != 2:
+        raise UserError(
+            f"The run must be of a robot with two grippers, found {len(grippers)} in {arguments.run}."
+        )
+    taking, giving = grippers  # the left hand takes
     log, delays = ActionLog(), {True: Counter(), False: Counter()}
     actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
     with Progress("hand-overs", arguments.episodes) as progress:

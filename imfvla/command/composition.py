@@ -37,6 +37,7 @@ VERSION_BASE = "1.3"
 SEARCH_PATH = "hydra.searchpath"
 COMMAND_LINE = "command-line"  # what Hydra calls the provider of --config-dir
 _MERGED = re.compile(r"Cannot merge \w+ with \w+ full_key: (\S+) object_type=(dict|list)")
+_INTERPOLATED = re.compile(r"Interpolation key '([^']+)' not found full_key: (\S+)")
 _KINDS = ("a list", "a mapping of keys to values")
 
 
@@ -171,6 +172,11 @@ def explain(
         return UserError(
             f"{key} must be {_KINDS[is_mapping]}, found {_KINDS[not is_mapping]}: write it as in "
             f"{shown(CONFIG_DIRECTORY)}."
+        )
+    if interpolated := _INTERPOLATED.search(text):
+        return UserError(
+            f"{interpolated.group(2)} takes the value of {interpolated.group(1)}, which {config_name}.yaml does not "
+            "have: choose another file of its group, or another command."
         )
     return UserError(
         f"The config {config_name} with {' '.join(overrides) or 'no overrides'} is wrong: {text}"

@@ -33,10 +33,10 @@ REMEDY = "leave --demos out to have the expert play"
 def settings_of(config: Mapping[str, Any]) -> BimanualSettings:
     """How the demonstrations of a run were recorded, also of one that is older than some of the settings."""
     task, demos = config["task"], config["demos"]
-    if kind_of(task) != BIMANUAL:
+    if kind_of(task) != BIMANUAL or not isinstance(task.get("expert"), Mapping):
         raise UserError(
-            f"The run must be of one of this package's own tasks, found {KIND}={kind_of(task)}: the hidden choice of "
-            "other experts is not known."
+            f"The run must be of one of this package's own tasks, found task={task.get('name')} of {KIND}="
+            f"{kind_of(task)}: the hidden choice of other experts is not known."
         )
     task = {**task, "expert": LATER_SETTINGS | task["expert"]}
     _, settings = read_settings(task, config["observation"], {"frames_directory": None} | demos, "demos")

@@ -66,7 +66,7 @@ def _unpacked(chunk: Chunk) -> bytes:
     elif chunk.compression == "":
         content = chunk.data
     else:
-        raise NotImplementedError(f"compression {chunk.compression!r}, wanted zstd, lz4 or none")
+        raise NotImplementedError(f"a chunk of compression {chunk.compression!r}, wanted zstd, lz4 or none")
     if len(content) != chunk.uncompressed_size:
         found = f"{len(content)}" if len(content) < most else "more"
         raise ValueError(f"a chunk of {found} bytes that states {chunk.uncompressed_size}")
@@ -115,7 +115,8 @@ def clear_read_errors(path: Path) -> Iterator[None]:
         ) from error
     except NotImplementedError as error:
         raise UserError(
-            f"Recording {path} is not supported ({error}): rewrite it with `mcap compress`, or record it again."
+            f"Recording {path} has {error} (others are not supported): rewrite it with `mcap compress`, or restore it "
+            "from a copy."
         ) from error
     except Exception as error:  # a damaged byte can raise anything from EndOfFile to KeyError
         # EINVAL comes from a damaged offset.

@@ -37,6 +37,14 @@ def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message)
     assert "\n" not in str(caught.value)
 
 
+def test_a_value_that_a_command_does_not_have_is_named():
+    with pytest.raises(
+        UserError,
+        match=r"^task\.robot\.cameras\[0\]\.height takes .* observation\.image_size\[0\], which gallery",
+    ):
+        compose("gallery", ["task=pusht"])
+
+
 def test_all_missing_values_are_named_at_once_with_what_they_may_be():
     with pytest.raises(UserError, match=r"^Missing values of demos\.action .*, demos\.control_hz ") as caught:
         compose("train", ["task=none", "demos=hdf5", "demos.instruction=go", "name=x"])

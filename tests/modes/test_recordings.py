@@ -77,3 +77,12 @@ def test_the_expert_plays_what_is_missing_and_failures_are_replaced(tmp_path, mo
         record_starts(CONFIG, tmp_path, 100_000, 3)
     with pytest.raises(UserError, match="found 1: trained on were 0 to 2"):
         record_starts(CONFIG, tmp_path, 1, 3)
+
+
+def test_a_run_of_another_task_has_no_hidden_choice_that_is_known():
+    for task in (
+        {"name": "none", "paraphrases": False},
+        {"name": "pusht", "kind": "gymnasium", "expert": None},
+    ):
+        with pytest.raises(UserError, match=rf"own tasks, found task={task['name']} of task\.kind="):
+            settings_of(CONFIG | {"task": task})

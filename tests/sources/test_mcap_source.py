@@ -73,6 +73,15 @@ def test_a_file_of_another_program_is_not_called_damaged(tmp_path):
     assert "damaged" not in str(error.value)
 
 
+def test_a_compression_that_is_not_read_is_not_called_damage(synthetic_demonstrations):
+    file = McapSource.of(synthetic_demonstrations).recordings.files[0]
+    file.write_bytes(file.read_bytes().replace(b"\x04\x00\x00\x00zstd", b"\x04\x00\x00\x00snap"))
+    with pytest.raises(
+        UserError, match=r"has a chunk of compression 'snap', wanted zstd, lz4 or none \(others"
+    ):
+        McapSource.of(synthetic_demonstrations).episode(0)
+
+
 def test_a_folder_without_recordings_is_named(tmp_path):
     with pytest.raises(UserError, match=r"No recordings .*nowhere"):
         mcap.open_source({"path": str(tmp_path / "nowhere")})

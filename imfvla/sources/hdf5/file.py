@@ -19,7 +19,7 @@ except ImportError as error:
 
 BLOCK = 64  # steps of pictures in memory besides the result
 MAX_CHUNK_BYTES = 2**30  # of one unpacked chunk, which the library keeps in memory whole
-CHOOSE = "correct the keys in the options"
+CHOOSE = "correct the layout or the keys in the options"
 
 
 @contextmanager

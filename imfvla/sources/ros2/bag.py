@@ -160,7 +160,7 @@ def clear_errors(path: Path) -> AbstractContextManager[None]:
         path,
         "a bag",
         "copy the bag again",
-        lambda error: f"has a message that is not supported: {error}; leave this topic out.",
+        lambda error: f"has what is not supported: {error}; leave this topic out, or rewrite the bag.",
         lambda error: f"must be a whole MCAP file of ROS 2, found it {_damage(path, error)}; {COPY}.",
         (Exception,),
     )
