@@ -17,6 +17,7 @@ SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/ge
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
+BUILD := $(PIP) install --no-deps --no-build-isolation
 INSTALLED := $(VENV)/.installed
 
 .PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery wheel test lint clean
@@ -82,13 +83,20 @@ clean:  ## Remove .venv and caches; runs/ and data/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(INSTALLED): pyproject.toml setup.py constraints.txt
+# Only files whose hash is known: setuptools first, since one package and labmaze's replacement are built. PyPI's torch
+# asks for CUDA packages, its CPU wheel for none. The last line installs this project and needs no other file.
+$(INSTALLED): pyproject.toml setup.py constraints.txt hashes.txt hashes-cuda.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "imfvla needs Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); name one: make setup PYTHON=python3.11" >&2; \
 	  exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { \
 	  echo "$(PYTHON) could not create a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
 	  exit 1; }
-	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(PIP) install ./tools/labmaze; fi
-	$(PIP) install -c constraints.txt -e '.[dev]'
+	@sed -n '/^setuptools==/,/[^\\]$$/p' hashes.txt > $(VENV)/setuptools.txt
+	@$(PIP) install --require-hashes -r $(VENV)/setuptools.txt
+	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(BUILD) ./tools/labmaze; fi
+	$(BUILD) --use-pep517 --require-hashes -r hashes.txt
+	@if $(PY) -c 'from importlib.metadata import requires; exit("cuda" not in str(requires("torch")))'; then \
+	  $(BUILD) --require-hashes -r hashes-cuda.txt; fi
+	$(BUILD) -e .
 	@touch $@

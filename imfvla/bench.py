@@ -9,6 +9,7 @@ import json
 import logging
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -141,30 +142,30 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
     from imfvla.training.data import prepare_windows
 
     parts, figures = config["parts"], {}
-    env = environment_of(composed)
-    if "simulation" in parts:
-        figures["simulation"] = measure_simulation(env)
-    if "simulation" in parts or "training" in parts:
-        demonstrating, demonstrations = measure_demonstrations(composed, scratch)
-        figures.setdefault("simulation", {}).update(demonstrating)
-    torch.manual_seed(0)
-    if "training" in parts:
-        source = McapSource(demonstrations)
-        policy = build_policy(composed, prepare_windows(composed, source).statistics())
-        with threads(torch.get_num_threads()):
-            figures["training"] = measure_training(
-                composed, policy, source, scratch / "run", config["training_steps"]
+    with closing(environment_of(composed)) as env:
+        if "simulation" in parts:
+            figures["simulation"] = measure_simulation(env)
+        if "simulation" in parts or "training" in parts:
+            demonstrating, demonstrations = measure_demonstrations(composed, scratch)
+            figures.setdefault("simulation", {}).update(demonstrating)
+        torch.manual_seed(0)
+        if "training" in parts:
+            source = McapSource(demonstrations)
+            policy = build_policy(composed, prepare_windows(composed, source).statistics())
+            with threads(torch.get_num_threads()):
+                figures["training"] = measure_training(
+                    composed, policy, source, scratch / "run", config["training_steps"]
+                )
+        else:
+            policy = build_unfitted(composed)
+        if "latency" in parts:
+            figures["latency"] = measure_latency(
+                env,
+                policy.eval(),
+                evaluations(composed, config),
+                calls=config["latency_calls"],
+                warm_up=config["latency_warm_up"],
             )
-    else:
-        policy = build_unfitted(composed)
-    if "latency" in parts:
-        figures["latency"] = measure_latency(
-            env,
-            policy.eval(),
-            evaluations(composed, config),
-            calls=config["latency_calls"],
-            warm_up=config["latency_warm_up"],
-        )
     return {"parameters": sum(parameter.numel() for parameter in policy.parameters()), **figures}
 
 

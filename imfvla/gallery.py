@@ -6,6 +6,7 @@ if __name__ == "__main__":
     begin()
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -54,18 +55,17 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
             f"task must be one of {', '.join(tasks.NAMES)}, whose experts have a hidden choice to show, found "
             f"{task.get('name')!r}: an evaluation films other environments."
         )
-    env = tasks.load(task["name"], variant=task["variant"])
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
-    seed, experts = _both_ways(env, task, seed)
-    for label, expert in experts.items():
-        frames = _play(env, expert, seed, size)
-        chosen = [frames[round(share * (len(frames) - 1))] for share in MOMENTS]
-        rows = [(f"{step / env.robot.control_hz:.1f} s", pictures) for step, pictures in chosen]
-        path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
-        write_together({path: png(contact_sheet(rows, env.all_views))})
-        paths.append(path)
-    env.close()
+    with closing(tasks.load(task["name"], variant=task["variant"])) as env:
+        seed, experts = _both_ways(env, task, seed)
+        for label, expert in experts.items():
+            frames = _play(env, expert, seed, size)
+            chosen = [frames[round(share * (len(frames) - 1))] for share in MOMENTS]
+            rows = [(f"{step / env.robot.control_hz:.1f} s", pictures) for step, pictures in chosen]
+            path = directory / f"{task['name']}-{task['variant']}-seed{seed}-{label}.png"
+            write_together({path: png(contact_sheet(rows, env.all_views))})
+            paths.append(path)
     return paths
 
 

@@ -10,14 +10,19 @@ torchrun                           SIGKILL of one of two processes at random mom
 stops                              Ctrl-C, SIGTERM and SIGUSR1 in the middle of training: seconds to the end, exit code
 disk                               a full file system, a read-only one (both mounted, where permitted) and no file
                                    handles left
+space                              a small disk (mounted) that is full again and again while it grows, for every kind of
+                                   work
 workers                            worker processes that die and hang in the middle of an evaluation
+frozen                             an evaluation and its worker that are stopped for a minute
 changes                            data, rows, numbers, config, weights and code that change silently
 leftovers                          SIGKILL within the writing of a state, always; what is left is counted
 strangers                          a link that leads out, a pipe, a socket, a device, a directory or 8 GB of zeros in
                                    place of a file of a run directory, four times as often
 publications                       four commands that publish into one folder at once
+reports                            reports in a loop over a run that is being trained and evaluated
 no_locks                           a file system without locks
 nfs                                frame stores that are replaced while in use, where open files cannot be deleted
+fuse                               kills and replaced stores on a FUSE mount (bindfs), a fifth as often
 
 Processes are forked after everything is imported, so that the signals hit the work itself. The policy is the tiny one
 of the tests (in a sweep a small one that is composed), and its environment replaces the simulator; loop,
@@ -48,6 +53,7 @@ from faults.fuse import fuse  # noqa: E402
 from faults.killing import kills_of  # noqa: E402
 from faults.leftovers import leftovers  # noqa: E402
 from faults.outcome import Differs, demonstrations_of, rows_of, state_of  # noqa: E402
+from faults.reports import reports  # noqa: E402
 from faults.sharing import nfs, no_locks, publications  # noqa: E402
 from faults.space import space  # noqa: E402
 from faults.stops import stops  # noqa: E402
@@ -55,7 +61,7 @@ from faults.strangers import strangers  # noqa: E402
 from faults.sweep import sweep  # noqa: E402
 from faults.torchrun import torchrun  # noqa: E402
 from faults.work import collect, roll_out, train  # noqa: E402
-from faults.workers import workers  # noqa: E402
+from faults.workers import frozen, workers  # noqa: E402
 
 FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "training": kills_of(partial(train, steps=150), state_of, 150),
@@ -67,11 +73,13 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "disk": disk,
     "space": space,
     "workers": workers,
+    "frozen": frozen,
     "changes": changes,
     "leftovers": leftovers,
     "strangers": strangers,
     "publications": publications,
     "no_locks": no_locks,
+    "reports": reports,
     "nfs": nfs,
     "fuse": fuse,
 }

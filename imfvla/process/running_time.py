@@ -1,4 +1,4 @@
-"""Time limits that do not run while this process is stopped: by Ctrl-Z, in a frozen container, in a sleeping machine."""
+"""Time limits that do not run while this process is stopped: by Ctrl-Z or in a frozen container."""
 
 import subprocess
 import time

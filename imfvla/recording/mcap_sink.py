@@ -30,18 +30,25 @@ class McapSink:
     frames and body poses that the simulator shows then belong to the next step and are kept until it
     comes. An environment without `scene` has no /tf and no /scene.
 
-    The file is written beside `path` under a hidden name and renamed by `end`; `abort`, and any error while
-    writing, removes it and leaves an earlier file at `path` unchanged. Raises UserError naming `path` where it cannot
-    be written.
+    The file is written beside `path` under a hidden name and renamed by `end`; `abort`, any error while writing and,
+    with `only_success`, an episode without success remove it and leave an earlier file at `path` unchanged. Raises
+    UserError naming `path` where it cannot be written.
     """
 
-    def __init__(self, path: str | Path, *, lossless: bool = True, render_every: int | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        lossless: bool = True,
+        render_every: int | None = None,
+        only_success: bool = False,
+    ) -> None:
         if render_every is not None and render_every < 1:
             raise ValueError(f"render_every must be at least 1 or None, found {render_every}.")
         self.path = Path(path)
         self._part = self.path.with_name(f".{self.path.name}.part")
         self._lossless = lossless
-        self._render_every = render_every
+        self._render_every, self._only_success = render_every, only_success
         self._stream = None
 
     def begin(self, env: Environment, info: EpisodeInfo) -> None:
@@ -108,7 +115,10 @@ class McapSink:
             self._writer.add_metadata(messages.RESULT_RECORD, messages.result_record(result, self._num_steps))
             self._writer.finish()
             self._stream.close()
-            put_file(self._part, self.path)
+            if result.success or not self._only_success:
+                put_file(self._part, self.path)
+            else:
+                self._part.unlink()
             self._stream = None
 
     def abort(self) -> None:

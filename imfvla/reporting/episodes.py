@@ -16,10 +16,20 @@ def read_episodes(path: Path, seeds: range, home: Path | None = None) -> tuple[R
 
     Raises UserError naming file and line where a row is cut off, damaged, foreign, repeated or missing.
     """
+    return parse_episodes(episode_lines(path, home), path, seeds)
+
+
+def episode_lines(path: Path, home: Path | None = None) -> list[str]:
+    """The text of `path`, by lines. Raises UserError where the file is missing or cannot be read."""
     if not path.exists():
         raise UserError(f"{path} is missing beside its summary.json: {REMEDY}.")
+    return read_lines(path, REMEDY, home=home)
+
+
+def parse_episodes(lines: Sequence[str], path: Path, seeds: range) -> tuple[Row, ...]:
+    """The rows that the lines of `path` have; see `read_episodes`."""
     rows: dict[int, Row] = {}
-    for number, line in enumerate(read_lines(path, REMEDY, home=home), 1):
+    for number, line in enumerate(lines, 1):
         where = f"{path}, line {number}"
         row = read_row(line, where)
         if row["seed"] not in seeds:

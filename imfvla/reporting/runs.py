@@ -1,5 +1,6 @@
 """Reads run directories: the evaluations of a run, one for each NFE."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +96,7 @@ def key_of(run: Path, experiment: str) -> str:
 
 
 def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
-    """All finished evaluations of a run, by folder name.
+    """All finished evaluations of a run, by folder name; one that is being replaced counts as unfinished.
 
     Raises UserError for broken summaries and episodes, and where config.yaml is not what was trained and evaluated.
 
@@ -103,7 +104,8 @@ def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list
     """
     config = run.config() if config is None else config
     folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
-    return [_read(run, folder, config) for folder in folders]
+    found = (_read_whole(run, folder, config) for folder in folders)
+    return [evaluation for evaluation in found if evaluation is not None]
 
 
 def rows(run: RunDirectory) -> list[Evaluation]:
@@ -130,13 +132,36 @@ def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
     """Runs in or below the directories, finished or not, in their order and by path within each."""
     found: dict[Path, None] = {}
     for root in directories:
-        found |= dict.fromkeys(path.parent for path in sorted(Path(root).glob("**/config.yaml")))
+        # `Path.glob` fails where a training deletes a folder meanwhile.
+        found |= dict.fromkeys(
+            sorted(Path(place) for place, _, names in os.walk(root) if "config.yaml" in names)
+        )
     return [RunDirectory(path) for path in found]
 
 
 def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
     summary = evaluation.summary
     return evaluation.is_reporting, evaluation.is_usual, summary["checkpoint_step"], summary["episodes"]
+
+
+def _read_whole(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation | None:
+    """An evaluation as one command wrote it, None while another one replaces it."""
+    while (before := _version(folder)) is not None:
+        try:
+            return _read(run, folder, config)
+        except UserError:
+            if _version(folder) == before:
+                raise
+    return None
+
+
+def _version(folder: Path) -> tuple[int, int] | None:
+    """Tells summaries apart that took each other's place; None where there is none."""
+    try:
+        found = os.lstat(folder / "summary.json")
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:

@@ -92,8 +92,9 @@ class RolloutLog:
             # Of other rows: a kill must not leave it beside the new ones.
             summary_path.unlink(missing_ok=True)
             sync(self.path)
-        write_text(self.path / EPISODES, "".join(dump_row(row) for row in rows))
-        summary = {**summary, DIGEST: self._config_digest, EPISODES_DIGEST: digest_of(self.path / EPISODES)}
+        text = "".join(dump_row(row) for row in rows)
+        write_text(self.path / EPISODES, text)
+        summary = {**summary, DIGEST: self._config_digest, EPISODES_DIGEST: digest_of(text)}
         write_json(summary_path, summary)
         self._stream.close()
         self._stream = None

@@ -18,7 +18,7 @@ from imfvla.process.progress import Progress
 from imfvla.recording import McapSink, Recordings, TruncatedRecording, read_index
 from imfvla.robot import RobotSpec
 from imfvla.sources.demonstrations import Settings, settings_of
-from imfvla.storage.files import clear_write_errors, delete_leftovers, locked, put_file, write_json
+from imfvla.storage.files import delete_leftovers, locked, write_json
 from imfvla.storage.fingerprint import physical_cores
 from imfvla.storage.records import Seed, read_record
 
@@ -174,15 +174,8 @@ def record_demonstration(settings: Settings, directory: Path, seed: int) -> tupl
     """Records the expert from `seed` into its file; a failed demonstration leaves no file. Runs in a worker."""
     env, expert = _stage_for(settings)
     path = recording_path(directory, seed)
-    # A temporary name until it has succeeded: a kill must not leave a failed episode under the final one.
-    trial = path.with_suffix(".mcap.trial")
-    sink = McapSink(trial, lossless=True, render_every=settings.camera_every)
+    sink = McapSink(path, lossless=True, render_every=settings.camera_every, only_success=True)
     result = run_episode(env, expert, seed, [sink], kind="demonstration", config=settings.to_json())
-    with clear_write_errors(path):
-        if result.success:
-            put_file(trial, path)
-        else:
-            trial.unlink()
     return seed, result.success
 
 

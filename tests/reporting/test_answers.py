@@ -142,7 +142,7 @@ def test_damaged_episodes_and_changed_summaries_are_named(tmp_path):
         match=r"episodes\.jsonl gives another success_episodes than its summary\.json: one was changed",
     ):
         answer("socket_infer2", tmp_path)
-    digest = {"episodes_digest": digest_of(folder / "episodes.jsonl")}
+    digest = {"episodes_digest": digest_of((folder / "episodes.jsonl").read_text(encoding="utf-8"))}
     summary.write_text(json.dumps(json.loads(text) | digest | {"avg_return": 1234.5}))
     (found,) = answer("socket_infer2", tmp_path).evaluated
     assert found.evaluation.summary["avg_return"] == json.loads(text)["avg_return"]

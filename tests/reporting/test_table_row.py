@@ -155,7 +155,7 @@ def test_a_number_that_was_written_into_the_summary_is_not_printed(run):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"avg_return": 1234.5}))
     with pytest.raises(UserError, match=r"episodes\.jsonl gives another avg_return than its summary\.json"):
         print_row(RunDirectory(run), Console(quiet=True))
-    digest = {"episodes_digest": digest_of(folder / "episodes.jsonl")}
+    digest = {"episodes_digest": digest_of((folder / "episodes.jsonl").read_text(encoding="utf-8"))}
     path.write_text(json.dumps(json.loads(path.read_text()) | digest))
     print_row(RunDirectory(run), Console(quiet=True))
     assert (run / "table_row.md").read_text() == EXPECTED

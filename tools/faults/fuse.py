@@ -13,7 +13,9 @@ from faults.outcome import Differs, demonstrations_of, rows_of, state_of
 from faults.sharing import stores_replaced
 from faults.work import collect, roll_out, train
 
-COMMAND = "bindfs"  # shows one folder at another place; it keeps an open file that is deleted as .fuse_hidden...
+COMMAND = (
+    "bindfs"  # shows one folder at another place; it keeps an open file that is deleted as .fuse_hidden...
+)
 
 
 def fuse(folder: Path, kills: int, rng: random.Random) -> str:

@@ -51,7 +51,7 @@ def half_written(folder: Path) -> set[tuple[str, int]]:
     found = set()
     for path in files_of(folder):
         with suppress(FileNotFoundError):
-            if {".tmp", ".part", ".trial"} & {path.suffix, path.parent.suffix} or is_cut(path):
+            if {".tmp", ".part"} & {path.suffix, path.parent.suffix} or is_cut(path):
                 found.add((path.name, path.stat().st_mtime_ns))
     return found
 

@@ -64,7 +64,7 @@ def demonstrations_of(folder: Path) -> dict[str, Any]:
             found |= {
                 f"{path.name} {view}": torch.from_numpy(images) for view, images in episode.images.items()
             }
-        elif path.suffix not in (".part", ".trial"):  # left by a kill; overwritten when its seed is played
+        elif path.suffix != ".part":  # left by a kill; overwritten when its seed is played
             found[path.name] = path.read_text(encoding="utf-8")
     return found
 

@@ -21,6 +21,7 @@ OF_FAKES = {  # of the config of a run that is evaluated
     "task": {"name": "fake", "variant": "default"},
     "observation": {"views": ["front"], "image_size": [16, 16]},
 }
+OPTIONS_OF_FAKES = EvaluationOptions(episodes=1, first_seed=100_000, nfe=(1,), workers=0)
 
 
 def train(folder: Path, steps: int, save_every_s: float = 0.0) -> None:
@@ -43,8 +44,7 @@ def roll_out(folder: Path, episodes: int) -> None:
 def play(folder: Path, episodes: int) -> None:
     """An evaluation of a run whose config has what OF_FAKES says."""
     workbench._bench.cache_clear()
-    options = EvaluationOptions(episodes=episodes, first_seed=100_000, nfe=(1,), workers=0)
-    evaluate(RunDirectory(folder), options, build=build_fakes)
+    evaluate(RunDirectory(folder), replace(OPTIONS_OF_FAKES, episodes=episodes), build=build_fakes)
 
 
 class Demonstrator:
