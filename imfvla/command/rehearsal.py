@@ -12,6 +12,7 @@ from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
 from imfvla.robot_of import has_environment
 from imfvla.rollouts.evaluation import require_device
+from imfvla.rollouts.offline import refuse_rollout_options
 from imfvla.storage.run_directory import step_of
 from imfvla.training.experiment import ExperimentOptions, read_experiment
 from imfvla.training.loop import choose_device
@@ -24,6 +25,7 @@ def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
     training, evaluation = options.training, options.evaluation
     if not has_environment(config):
         part_of(config, "task.held_out")
+        refuse_rollout_options(evaluation)
     paraphrases = part_of(config, "task.paraphrases")
     require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
     choose_device(training.device)

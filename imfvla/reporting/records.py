@@ -6,9 +6,9 @@ Keys that are not listed may be there too, with plain values: another version of
 from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
-from imfvla.config.protocol import MAX_EPISODES
-from imfvla.options import above, at_most, of_length, within
-from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Name, Seed, Step
+from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE
+from imfvla.options import above, at_most, of_length, one_of, within
+from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
 
 MOST_STEPS = 10**7  # control steps of an episode
 MOST_STAGES = 100
@@ -63,6 +63,28 @@ class ProtocolRecord(TypedDict):
     episodes: NotRequired[Count]
     max_steps: NotRequired[Annotated[int, within(1, MOST_STEPS)] | None]
     device: NotRequired[Name]
+    # As `config.protocol.USUAL` where it is older than them.
+    clock: NotRequired[Annotated[str, one_of(*CLOCKS)]]
+    delay_ms: NotRequired[Annotated[int | float | str, DELAY]]
+    delay_steps: NotRequired[Annotated[int, within(0, MOST_STEPS)]]
+    meanwhile: NotRequired[Annotated[str, one_of(*MEANWHILE)]]
+
+
+class Latency(TypedDict):
+    """The time of a chunk, taken alone: see `rollouts.latency`."""
+
+    weights: NotRequired[Name]
+    nfe: NotRequired[Nfe]
+    device: NotRequired[Name]
+    machine: NotRequired[Machine]
+    median_ms: Positive
+    p95_ms: Positive
+    calls: Count
+    at: Name
+    load: Duration  # mean number of waiting processes in the minute before
+
+
+Latencies = Annotated[list[Latency], at_most(1000)]  # latency.json
 
 
 class Summary(TypedDict):
@@ -91,5 +113,6 @@ class Summary(TypedDict):
     stages: NotRequired[Annotated[list[Label], at_most(MOST_STAGES)]]
     seeds: Annotated[list[Seed], of_length(2)]
     protocol: ProtocolRecord
+    latency_alone: NotRequired[Latency]  # what a measured delay is
     recordings: NotRequired[Annotated[Mapping[str, Recording], at_most(100)]]
     fingerprint: Fingerprint

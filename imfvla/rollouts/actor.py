@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.protocol import CONTINUE, USUAL_NOISE
 from imfvla.data.resample import resample
 from imfvla.environment import Environment
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.episode import Decision
 from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
+from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.ensemble import TemporalEnsemble
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.types import Observation, tokenize
@@ -27,8 +28,9 @@ FAR = 10.0
 
 
 class ChunkActor:
-    """Plays a policy in closed loop: an `episode.Actor` that replans every `horizon.exec` control steps.
+    """Plays a policy in closed loop: an `episode.Actor` that looks and replans when its clock says so.
 
+    Without a clock, the world waits for every chunk, and the policy replans every `horizon.exec` control steps.
     Cameras are rendered only at the steps that enter a decision. The noise of replanning k in the
     episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so all policies with chunks of
     the same shape see the same noise. It is multiplied by `noise_scale`.
@@ -43,9 +45,11 @@ class ChunkActor:
         device: torch.device | str = "cpu",
         *,
         noise_scale: float = USUAL_NOISE,
+        clock: Clock | None = None,
     ) -> None:
         self._policy = policy.eval()
         self._horizon = horizon
+        self._clock = clock or Clock(horizon)
         self._nfe = nfe
         self._noise_seed, self._noise_scale = noise_seed, noise_scale
         self._device = torch.device(device)
@@ -69,36 +73,52 @@ class ChunkActor:
         self._seed = seed
         self._images: dict[int, list[np.ndarray]] = {}
         self._states: dict[int, np.ndarray] = {}
+        self._coming: tuple[int, np.ndarray] | None = None  # decision and chunk that is not there yet
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
     def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
-        """The action of `step`; looks and replans where the horizon says so.
+        """The action of `step`; looks and replans where the clock says so.
 
         Raises:
           ActionError: the part of the chunk that would be executed is not finite, or far outside the limits.
         """
         images = chunk = inference_ms = None
-        if self._horizon.is_observed(step):
+        self._receive(step)
+        if self._clock.is_observed(step):
             images = env.look()
             self._images[step] = [images[view] for view in self._policy.views]
             self._states[step] = state
-        if self._horizon.is_decision(step):
+        if self._clock.is_decision(step):
             steps = self._horizon.observed_steps(step)
             self._images = {s: self._images[s] for s in steps}
             self._states = {s: self._states[s] for s in steps}
             chunk, inference_ms = self.plan(
-                [self._images[s] for s in steps], [self._states[s] for s in steps], step // self._horizon.exec
+                [self._images[s] for s in steps], [self._states[s] for s in steps], self._clock.number(step)
             )
-            self._check(chunk[: self._horizon.exec])
-            self._chunk, self._decided_at = chunk, step
-        if self._ensemble is None:
-            action = self._chunk[step - self._decided_at]
-        else:
-            self._ensemble.add(step, self._chunk)
-            action = self._ensemble.action(step)
-        action = np.clip(action, self._minimum, self._maximum).astype(np.float32)
+            self._check(chunk[self._clock.executed(step)])
+            self._coming = (step, chunk)
+            self._receive(step)
+        if self._coming is None or self._clock.meanwhile == CONTINUE:
+            self._target = self._planned(step)
+        action = self._target
         return Decision(action=action, executed=action, images=images, chunk=chunk, inference_ms=inference_ms)
+
+    def _receive(self, step: int) -> None:
+        """Takes the chunk that is there from `step` on, if any."""
+        if self._coming is not None and self._clock.arrival(self._coming[0]) == step:
+            self._decided_at, self._chunk = self._coming
+            self._coming = None
+            if self._ensemble is not None:
+                self._ensemble.add(self._decided_at, self._chunk)
+
+    def _planned(self, step: int) -> np.ndarray:
+        """What the present chunk, or all that cover `step`, say: float32 (A,) within the limits."""
+        if self._ensemble is None:
+            action = self._chunk[self._clock.entry(step, self._decided_at)]
+        else:
+            action = self._ensemble.action(step)
+        return np.clip(action, self._minimum, self._maximum).astype(np.float32)
 
     @torch.inference_mode()
     def plan(

@@ -13,6 +13,7 @@ from imfvla.config.protocol import EvaluationOptions
 from imfvla.data import Windows
 from imfvla.data.same_content import refuse_other_content
 from imfvla.errors import UserError
+from imfvla.options import require
 from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
@@ -31,6 +32,11 @@ MOST_COMPARED = 20_000  # of the training episodes, among which the nearest is l
 ROWS = 32  # chunks that are computed together
 
 
+def refuse_rollout_options(options: EvaluationOptions) -> None:
+    """Raises UserError where an option asks for what only an environment has."""
+    require(not options.is_running, "evaluation.clock", "paused where there is no environment", options.clock)
+
+
 def evaluate_offline(
     run: RunDirectory, config: Mapping[str, Any], options: EvaluationOptions
 ) -> dict[str, Any]:
@@ -41,6 +47,7 @@ def evaluate_offline(
     held-out decisions; steps past an episode's end do not count, and are null where none counts. Raises UserError where
     there are no such weights, and where these were trained with another config or on other data.
     """
+    refuse_rollout_options(options)
     step = run.weights_step(options.checkpoint)
     refuse_changed_config(run, run.config(), step)
     windows = prepare_windows(config, open_source(config))

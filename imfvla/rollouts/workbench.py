@@ -1,20 +1,23 @@
 """What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from imfvla.config.protocol import Protocol, unusual
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
 from imfvla.environments.rollout import run_episode
-from imfvla.reporting.records import Row
+from imfvla.reporting.records import Latency, Row
 from imfvla.reporting.rows import row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.clock import Clock
+from imfvla.rollouts.latency import measure_latency
 from imfvla.storage.run_directory import RunDirectory
 
 VIDEO_HEIGHT = 240  # of a view [px]
@@ -28,12 +31,12 @@ class Job:
 
     build: Build
     run: Path
-    step: int
-    nfe: int
-    noise_seed: int
-    noise_scale: float
-    max_steps: int | None
-    device: str  # of the policy
+    protocol: Protocol
+
+    @property
+    def step(self) -> int:
+        """Of the weights."""
+        return self.protocol.checkpoint_step
 
 
 def load_workbench(run: Path, step: int) -> tuple[Environment, Any]:
@@ -62,6 +65,14 @@ def describe_world(job: Job) -> World:
     return World(env.renderer(), None if env.goal else env.stages)
 
 
+def measure_alone(job: Job) -> Latency:
+    """The time of a chunk of the job's policy, see `rollouts.latency`."""
+    env, policy = _bench(job.build, job.run, job.step)
+    with one_thread():
+        actor = actor_of(job.protocol, policy)
+        return measure_latency(env, actor, policy.horizon.obs, policy.views, job.protocol.nfe)
+
+
 def roll_out(job: Job, seed: int) -> dict[str, Any]:
     """The row of the episode from `seed`."""
     return _play(job, seed, [])
@@ -88,26 +99,51 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
     env, policy = _bench(job.build, job.run, job.step)
-    policy.check_sampling(job.nfe, job.noise_scale)
-    actor = ChunkActor(
-        policy.to(job.device),
-        policy.horizon,
-        job.nfe,
-        job.noise_seed,
-        job.device,
-        noise_scale=job.noise_scale,
-    )
+    actor = actor_of(job.protocol, policy)
     config = RunDirectory(job.run).config() if sinks else {}
-    metadata = {"policy": str(config.get("name", "")), "nfe": job.nfe, "checkpoint_step": job.step}
-    threads = torch.get_num_threads()
+    metadata = {
+        "policy": str(config.get("name", "")),
+        "nfe": job.protocol.nfe,
+        "checkpoint_step": job.step,
+        **({"unusual": said} if (said := ", ".join(unusual(asdict(job.protocol)))) else {}),
+    }
+    with one_thread():
+        result = run_episode(
+            env,
+            actor,
+            seed,
+            sinks,
+            kind="rollout",
+            config=config,
+            metadata=metadata,
+            max_steps=job.protocol.max_steps,
+        )
+    return row_of(result)
+
+
+def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
+    """A policy at work as a protocol says. Raises UserError where it cannot work so."""
+    policy.check_sampling(protocol.nfe, protocol.noise_scale)
+    return ChunkActor(
+        policy.to(protocol.device),
+        policy.horizon,
+        protocol.nfe,
+        protocol.noise_seed,
+        protocol.device,
+        noise_scale=protocol.noise_scale,
+        clock=Clock(policy.horizon, protocol.delay_steps, protocol.meanwhile),
+    )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch computes with one thread inside this context."""
+    before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        result = run_episode(
-            env, actor, seed, sinks, kind="rollout", config=config, metadata=metadata, max_steps=job.max_steps
-        )
+        yield
     finally:
-        torch.set_num_threads(threads)
-    return row_of(result)
+        torch.set_num_threads(before)
 
 
 @lru_cache(maxsize=1)
