@@ -62,8 +62,9 @@ tables: setup  ## Make the paper's tables and figures and a page from the run di
 report: setup  ## Make them in experiments/report, with videos and recordings: a folder to send or serve
 	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
-gallery: setup  ## Write pictures of every view of the tasks
+gallery: setup  ## Write pictures of every view of the tasks, and of every condition of an evaluation
 	for task in socket transfer either_arm gate; do $(PY) -m imfvla.gallery task=$$task $(ARGS); done
+	for task in socket transfer; do $(PY) -m imfvla.gallery task=$$task of=conditions size=140; done
 
 wheel: $(INSTALLED)  ## Build dist/imfvla-*.whl, which works from any directory
 	rm -rf build dist

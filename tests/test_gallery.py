@@ -3,7 +3,7 @@ import pytest
 
 from imfvla import tasks
 from imfvla.figures.contact_sheet import GAP
-from imfvla.gallery import write_gallery
+from imfvla.gallery import write_conditions, write_gallery
 
 
 @pytest.mark.parametrize("name", tasks.NAMES)
@@ -17,3 +17,21 @@ def test_both_ways_of_the_hidden_choice_are_shown_from_one_start(name, tmp_path)
     row = (shape[0] - 24) // 4  # of pictures with its line of text, about
     assert (sheets[0][:row] == sheets[1][:row]).all()
     assert (sheets[0][row : 2 * row] != sheets[1][row : 2 * row]).any()
+
+
+def test_every_condition_and_severity_is_shown_at_the_start_and_later(tmp_path, monkeypatch):
+    monkeypatch.setattr("imfvla.config.condition.CONDITIONS", ("camera_pose", "friction"))
+    monkeypatch.setattr("imfvla.gallery.LATER_S", 0.1)
+    task = {
+        "name": "transfer",
+        "variant": "easy",
+        "expert": {"modes": 2, "noise": 0.0, "hold": 18, "dwell": 0},
+    }
+    (path,) = write_conditions(task, 0, 48, tmp_path)
+    sheet = cv2.imread(str(path))
+    assert sheet.shape[1] == GAP + 6 * (48 + GAP)
+    line = (sheet.shape[0] - 3 * (48 + GAP)) // 4
+    tops = [2 * line + number * (line + 48 + GAP) for number in range(3)]
+    none, camera, friction = (sheet[top : top + 48] for top in tops)
+    assert (none[:, : 48 + GAP] != camera[:, : 48 + GAP]).any()
+    assert (none[:, : 48 + GAP] == friction[:, : 48 + GAP]).all()

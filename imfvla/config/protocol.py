@@ -7,6 +7,7 @@ from fractions import Fraction
 from itertools import chain
 from typing import Annotated, Any
 
+from imfvla.config.condition import NONE, UNCHANGED, ConditionOptions
 from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
@@ -52,6 +53,7 @@ class EvaluationOptions:
       clock: "paused", where the world waits while the policy computes, or "running".
       delay_ms: on a running clock, the time from a look to its chunk; "measured" takes this policy's own.
       meanwhile: what the robot does until then: "hold" its last target, or "continue" with its present chunk.
+      condition: how the world differs from the one that was trained in.
       device: where the policy computes.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
       episode_timeout_s: an episode that takes longer is replayed in a fresh worker; None: no limit.
@@ -69,6 +71,7 @@ class EvaluationOptions:
     clock: Annotated[str, one_of(*CLOCKS)] = PAUSED
     delay_ms: Annotated[int | float | str, DELAY] = MEASURED
     meanwhile: Annotated[str, one_of(*MEANWHILE)] = HOLD
+    condition: ConditionOptions = UNCHANGED
     device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
     workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
     episode_timeout_s: (
@@ -108,6 +111,8 @@ class EvaluationOptions:
             "clock": self.clock,
             "delay_ms": self.delay_ms if self.is_running else 0,
             "meanwhile": self.meanwhile,
+            "condition": self.condition.name,
+            "severity": self.condition.severity,
         }
 
 
@@ -132,6 +137,8 @@ class Protocol:
     )
     delay_steps: int = 0  # the same in control steps, rounded up
     meanwhile: str = HOLD
+    condition: str = NONE
+    severity: int | None = None
 
     @property
     def seeds(self) -> range:
@@ -146,6 +153,7 @@ class Protocol:
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
+            f"_{self.condition}{self.severity}": self.condition != NONE,
         }
         suffixes = "".join(text for text, applies in unusual.items() if applies)
         return f"seeds{self.seeds[0]}-{self.seeds[-1]}_nfe{self.nfe}{suffixes}"
@@ -164,6 +172,8 @@ USUAL = {
     "delay_ms": 0,
     "delay_steps": 0,
     "meanwhile": HOLD,
+    "condition": NONE,
+    "severity": None,
 }
 
 
@@ -181,6 +191,8 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
         steps, source = protocol["delay_steps"], protocol["delay_ms"]
         delay = "measured delay" if source == MEASURED else f"delay {source:g} ms"
         said.append(f"{delay} ({steps} {'step' if steps == 1 else 'steps'}), {protocol['meanwhile']}")
+    if protocol["condition"] != NONE:
+        said.append(f"{protocol['condition']} {protocol['severity']}")
     return tuple(said)
 
 

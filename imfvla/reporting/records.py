@@ -6,6 +6,7 @@ Keys that are not listed may be there too, with plain values: another version of
 from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
+from imfvla.config.condition import SEVERITIES
 from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE
 from imfvla.options import above, at_most, of_length, one_of, within
 from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
@@ -68,6 +69,8 @@ class ProtocolRecord(TypedDict):
     delay_ms: NotRequired[Annotated[int | float | str, DELAY]]
     delay_steps: NotRequired[Annotated[int, within(0, MOST_STEPS)]]
     meanwhile: NotRequired[Annotated[str, one_of(*MEANWHILE)]]
+    condition: NotRequired[Name]
+    severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
 
 
 class Latency(TypedDict):

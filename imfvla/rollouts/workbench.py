@@ -9,6 +9,8 @@ from typing import Any
 
 import torch
 
+from imfvla.conditions import changed
+from imfvla.config.condition import NONE
 from imfvla.config.protocol import Protocol, unusual
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
@@ -61,13 +63,13 @@ class World:
 
 def describe_world(job: Job) -> World:
     """Of the environment in which episodes are played."""
-    env, _ = _bench(job.build, job.run, job.step)
+    env, _ = _place(job)
     return World(env.renderer(), None if env.goal else env.stages)
 
 
 def measure_alone(job: Job) -> Latency:
     """The time of a chunk of the job's policy, see `rollouts.latency`."""
-    env, policy = _bench(job.build, job.run, job.step)
+    env, policy = _place(job)
     with one_thread():
         actor = actor_of(job.protocol, policy)
         return measure_latency(env, actor, policy.horizon.obs, policy.views, job.protocol.nfe)
@@ -86,7 +88,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
     """
     from imfvla.recording import McapSink, VideoSink  # imported here: nothing else writes videos
 
-    env, _ = _bench(job.build, job.run, job.step)
+    env, _ = _place(job)
     sinks = [
         McapSink(path, lossless=False),
         VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), height=VIDEO_HEIGHT),
@@ -98,7 +100,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
-    env, policy = _bench(job.build, job.run, job.step)
+    env, policy = _place(job)
     actor = actor_of(job.protocol, policy)
     config = RunDirectory(job.run).config() if sinks else {}
     metadata = {
@@ -146,6 +148,16 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def _place(job: Job) -> tuple[Environment, Any]:
+    """Environment and policy of a job, each made once."""
+    protocol = job.protocol
+    return _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+
+
 @lru_cache(maxsize=1)
-def _bench(build: Build, run: Path, step: int) -> tuple[Environment, Any]:
-    return build(run, step)
+def _bench(
+    build: Build, run: Path, step: int, condition: str = NONE, severity: int | None = None
+) -> tuple[Environment, Any]:
+    """An environment for each condition, since some change its simulation."""
+    env, policy = build(run, step)
+    return changed(env, condition, severity), policy

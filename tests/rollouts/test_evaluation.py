@@ -9,6 +9,7 @@ import pytest
 import yaml
 from fakes import FakeEnvironment, KnownPolicy, build_fakes
 
+from imfvla.config.condition import ConditionOptions
 from imfvla.config.protocol import USUAL, EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
@@ -243,7 +244,7 @@ def test_two_evaluations_do_not_write_into_one_folder(run):
 
 def test_known_policies_are_reset_between_episodes(run):
     roll(run)
-    _, policy = workbench._bench(build_fakes, run.path, 20)
+    _, policy = workbench._bench(build_fakes, run.path, 20, "none", None)
     assert isinstance(policy, KnownPolicy)
     assert [steps[0] for steps in policy.seen[:11]] == [*range(0, 40, 4), 0]
 
@@ -412,3 +413,24 @@ def test_a_delay_that_is_too_long_is_refused_before_anything_runs(run):
     ):
         running(run, delay_ms=100, meanwhile="continue")
     assert not (run.path / "rollouts").exists()
+
+
+def test_a_condition_is_part_of_protocol_name_and_row_and_leaves_the_starts(run):
+    (plain,) = roll(run)
+    before = untimed_lines(run.rollouts(NAME))
+    (summary,) = roll(run, condition=ConditionOptions("action_lag", 2))
+    assert summary["name"] == f"{NAME}_action_lag2"
+    assert (summary["protocol"]["condition"], summary["protocol"]["severity"]) == ("action_lag", 2)
+    found = {evaluation.folder.name: evaluation for evaluation in evaluations(run)}
+    assert found[summary["name"]].unusual == ("action_lag 2",)
+    digests = [[row["start_digest"] for row in found[name].episodes] for name in (NAME, summary["name"])]
+    assert digests[0] == digests[1]
+    assert roll(run, overwrite=True)[0]["protocol"] == plain["protocol"]
+    assert untimed_lines(run.rollouts(NAME)) == before
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_condition_that_the_environment_cannot_have_is_refused_before_anything_runs(run, workers):
+    with pytest.raises(UserError, match=r"condition=mass needs a MuJoCo simulation .* the environment fake"):
+        roll(run, condition=ConditionOptions("mass", 1), workers=workers)
+    assert not list(run.path.glob("rollouts/*"))
