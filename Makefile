@@ -18,7 +18,7 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery wheel test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell sweep-clock sweep-conditions campaign bench tables report gallery wheel test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
@@ -47,7 +47,9 @@ sweep-horizon:  ## Vary predicted and executed steps
 sweep-evaluations:  ## Evaluate with 1 to 10 steps per chunk
 sweep-dwell:  ## Train and evaluate every method on the task where averages fail
 sweep-demonstrations:  ## Train on 25 to 200 demonstrations
-sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell: sweep-%: setup
+sweep-clock:  ## Evaluate object transfer while the clock runs (Table 4)
+sweep-conditions:  ## Evaluate object transfer in a changed world (Table 5)
+sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell sweep-clock sweep-conditions: sweep-%: setup
 	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
 
 campaign: setup  ## Train, evaluate and keep every policy of Tables 1 and 2 and the controls (ARGS="--side-by-side 2")

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from imfvla.config.construction import reason_of
-from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.protocol import FRESH, USUAL_NOISE
 from imfvla.errors import UserError
 from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
@@ -41,7 +41,9 @@ def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
     return options
 
 
-def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
+def rehearse(
+    config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE, noise: str = FRESH
+) -> Policy:
     """The configured policy, after the losses of its first and last step and a chunk on black pictures.
 
     Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
@@ -49,7 +51,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
     try:
         policy = build_unfitted(config).eval()
         for number in nfe:
-            policy.check_sampling(number, noise_scale)
+            policy.check_sampling(number, noise_scale, noise)
         observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():

@@ -11,6 +11,8 @@ from imfvla.config.condition import NONE, UNCHANGED, ConditionOptions
 from imfvla.options import Limit, above, at_least, one_of, require, some, within
 
 USUAL_NOISE = 1.0
+FRESH, HELD, ROLLED, ZERO = NOISES = "fresh", "held", "rolled", "zero"
+MOST_CANDIDATES = 64
 PAUSED, RUNNING = CLOCKS = "paused", "running"
 HOLD, CONTINUE = MEANWHILE = "hold", "continue"
 MEASURED = "measured"
@@ -50,6 +52,8 @@ class EvaluationOptions:
       checkpoint: the training step of the weights, a share of the training such as "1/3", or "last".
       noise_seed: of the noise streams; use the same for policies to be compared.
       noise_scale: of the noise that a chunk starts from; below 1 samples are closer to each other.
+      noise: what becomes of it from one replanning to the next, see `rollouts.noise`.
+      candidates: samples of a replanning, of which the one nearest to the last chunk is executed.
       clock: "paused", where the world waits while the policy computes, or "running".
       delay_ms: on a running clock, the time from a look to its chunk; "measured" takes this policy's own.
       meanwhile: what the robot does until then: "hold" its last target, or "continue" with its present chunk.
@@ -68,6 +72,8 @@ class EvaluationOptions:
     checkpoint: Annotated[int | str, CHECKPOINT] = LAST
     noise_seed: Annotated[int, within(0, MAX_SEED)] = 0
     noise_scale: Annotated[float, within(0, 1)] = USUAL_NOISE
+    noise: Annotated[str, one_of(*NOISES)] = FRESH
+    candidates: Annotated[int, within(1, MOST_CANDIDATES)] = 1
     clock: Annotated[str, one_of(*CLOCKS)] = PAUSED
     delay_ms: Annotated[int | float | str, DELAY] = MEASURED
     meanwhile: Annotated[str, one_of(*MEANWHILE)] = HOLD
@@ -84,6 +90,9 @@ class EvaluationOptions:
     def __post_init__(self) -> None:
         last = self.first_seed + self.episodes - 1
         require(last <= MAX_SEED, "the last seed, first_seed + episodes - 1,", f"at most {MAX_SEED}", last)
+        one_noise = self.candidates > 1 and (self.noise != FRESH or self.noise_scale == 0)
+        wanted = "1 unless noise is fresh and noise_scale above 0: equal noise gives equal samples"
+        require(not one_noise, "candidates", wanted, self.candidates)
         for key, usual in (("delay_ms", MEASURED), ("meanwhile", HOLD)):
             value = getattr(self, key)
             needless = self.clock == PAUSED and value != usual
@@ -108,6 +117,8 @@ class EvaluationOptions:
             "episodes": self.episodes,
             "max_steps": self.max_steps,
             "device": self.device,
+            "noise": self.noise,
+            "candidates": self.candidates,
             "clock": self.clock,
             "delay_ms": self.delay_ms if self.is_running else 0,
             "meanwhile": self.meanwhile,
@@ -141,6 +152,11 @@ class Protocol:
     severity: int | None = None
 
     @property
+    def tells_jumps(self) -> bool:
+        """Whether rows have the distance between consecutive chunks; those of the tables keep their bytes."""
+        return (self.noise, self.candidates, self.clock) != (FRESH, 1, PAUSED)
+
+    @property
     def seeds(self) -> range:
         return range(self.first_seed, self.first_seed + self.episodes)
 
@@ -150,6 +166,8 @@ class Protocol:
             f"_step{self.checkpoint_step}": self.checkpoint_step != last_step,
             f"_noise{self.noise_seed}": self.noise_seed != 0,
             f"_scale{self.noise_scale:g}": self.noise_scale != USUAL_NOISE,
+            f"_{self.noise}": self.noise != FRESH,
+            f"_best{self.candidates}": self.candidates != 1,
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
@@ -168,6 +186,8 @@ def demonstration_seeds(first_seed: int) -> Iterator[int]:
 # What a protocol has where its evaluation is as in the tables, and where it is older than the key.
 USUAL = {
     "noise_scale": USUAL_NOISE,
+    "noise": FRESH,
+    "candidates": 1,
     "clock": PAUSED,
     "delay_ms": 0,
     "delay_steps": 0,
@@ -187,10 +207,15 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
     said = []
     if protocol["noise_scale"] != USUAL_NOISE:
         said.append(f"noise {protocol['noise_scale']:g}")
+    if protocol["noise"] != FRESH:
+        said.append(f"{protocol['noise']} noise")
+    if protocol["candidates"] != 1:
+        said.append(f"best of {protocol['candidates']}")
     if protocol["clock"] != PAUSED:
         steps, source = protocol["delay_steps"], protocol["delay_ms"]
         delay = "measured delay" if source == MEASURED else f"delay {source:g} ms"
-        said.append(f"{delay} ({steps} {'step' if steps == 1 else 'steps'}), {protocol['meanwhile']}")
+        counted = "" if steps is None else f" ({steps} {'step' if steps == 1 else 'steps'})"
+        said.append(f"{delay}{counted}, {protocol['meanwhile']}")
     if protocol["condition"] != NONE:
         said.append(f"{protocol['condition']} {protocol['severity']}")
     return tuple(said)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
 from imfvla.config.condition import SEVERITIES
-from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE
+from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE, MOST_CANDIDATES, NOISES
 from imfvla.options import above, at_most, of_length, one_of, within
 from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
 
@@ -42,6 +42,7 @@ class Row(TypedDict):
     first_step_of_stage: Annotated[list[Annotated[int, within(-1, MOST_STEPS)]], at_most(MOST_STAGES)]
     failure: Name | None
     goal: NotRequired[Name]
+    chunk_jump: NotRequired[Annotated[float, within(0, LARGEST)]]
     timing: Timing
 
 
@@ -69,6 +70,8 @@ class ProtocolRecord(TypedDict):
     delay_ms: NotRequired[Annotated[int | float | str, DELAY]]
     delay_steps: NotRequired[Annotated[int, within(0, MOST_STEPS)]]
     meanwhile: NotRequired[Annotated[str, one_of(*MEANWHILE)]]
+    noise: NotRequired[Annotated[str, one_of(*NOISES)]]
+    candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     condition: NotRequired[Name]
     severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
 
@@ -78,6 +81,7 @@ class Latency(TypedDict):
 
     weights: NotRequired[Name]
     nfe: NotRequired[Nfe]
+    candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     device: NotRequired[Name]
     machine: NotRequired[Machine]
     median_ms: Positive

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, as_recorded, unusual
+from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL, as_recorded, unusual
 from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.reporting.mapping import TableRow, read_mapping
@@ -45,7 +45,14 @@ class Evaluation:
     @property
     def is_usual(self) -> bool:
         """Whether noise, clock and world were as in all rows of the tables."""
-        return not self.unusual
+        return not self.changes
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """What was not, as keys and values of the protocol."""
+        protocol = self.summary["protocol"]
+        asked = (key for key in USUAL if key != "delay_steps")  # which follows from the others
+        return {key: protocol[key] for key in asked if protocol[key] != USUAL[key]}
 
     @property
     def unusual(self) -> tuple[str, ...]:

@@ -32,13 +32,17 @@ CALLS, FEWEST_CALLS, WARM_UP = (
 def latency_of(
     run: RunDirectory, protocol: Protocol, measure: Callable[[], Latency], *, again: bool = False
 ) -> Latency:
-    """The time of a chunk of these weights with this NFE on this device and machine: the kept one, or `measure`'s.
+    """The time of a chunk of these weights with this NFE, so many candidates, on this device and machine.
+
+    It is the kept one, or that of `measure`.
 
     `again` measures in any case. Raises UserError where the file is damaged.
     """
     path = run.path / FILE
     kept = read_record(path, Latencies, REMEDY, home=run.path) if path.exists() else []
-    of = {key: getattr(protocol, key) for key in ("weights", "nfe", "device")} | {"machine": machine()}
+    of = {key: getattr(protocol, key) for key in ("weights", "nfe", "candidates", "device")} | {
+        "machine": machine()
+    }
     others = [found for found in kept if any(found.get(key) != value for key, value in of.items())]
     if len(others) < len(kept) and not again:
         return next(found for found in kept if found not in others)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.condition import UNCHANGED
+from imfvla.config.protocol import FRESH, PAUSED, EvaluationOptions
 from imfvla.data import Windows
 from imfvla.data.same_content import refuse_other_content
 from imfvla.errors import UserError
@@ -34,7 +35,9 @@ ROWS = 32  # chunks that are computed together
 
 def refuse_rollout_options(options: EvaluationOptions) -> None:
     """Raises UserError where an option asks for what only an environment has."""
-    require(not options.is_running, "evaluation.clock", "paused where there is no environment", options.clock)
+    for key, usual in (("clock", PAUSED), ("noise", FRESH), ("candidates", 1), ("condition", UNCHANGED)):
+        found = getattr(options, key)
+        require(found == usual, f"evaluation.{key}", "as usual where there is no environment", found)
 
 
 def evaluate_offline(

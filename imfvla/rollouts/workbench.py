@@ -125,7 +125,7 @@ def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
 
 def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
     """A policy at work as a protocol says. Raises UserError where it cannot work so."""
-    policy.check_sampling(protocol.nfe, protocol.noise_scale)
+    policy.check_sampling(protocol.nfe, protocol.noise_scale, protocol.noise)
     return ChunkActor(
         policy.to(protocol.device),
         policy.horizon,
@@ -133,7 +133,10 @@ def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
         protocol.noise_seed,
         protocol.device,
         noise_scale=protocol.noise_scale,
+        noise=protocol.noise,
+        candidates=protocol.candidates,
         clock=Clock(policy.horizon, protocol.delay_steps, protocol.meanwhile),
+        tells_jumps=protocol.tells_jumps,
     )
 
 
