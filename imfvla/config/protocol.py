@@ -142,6 +142,8 @@ class Protocol:
     episodes: int
     max_steps: int | None  # control steps of an episode, None for all of them
     device: str  # "cpu" or "cuda", where the policy computes
+    noise: str = FRESH  # from one replanning to the next
+    candidates: int = 1
     clock: str = PAUSED
     delay_ms: float | str = (
         0  # that was asked for; "measured": this policy's own on the machine of the summary

@@ -80,7 +80,7 @@ def _draw(axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str]) -> 
     for method, points in lines.items():
         if points:
             points = sorted(points, key=lambda point: point[0])
-            shares = [result.metrics["success_share"].scaled(100) for _, result in points]
+            shares = [result.metric("success_share").scaled(100) for _, result in points]
             number = methods.index(method)
             axes.errorbar(
                 [x for x, _ in points],

@@ -133,7 +133,7 @@ def _data(one: Changed) -> tuple[str, ...]:
     alone = [summary["latency_alone"]["median_ms"] for summary in summaries if "latency_alone" in summary]
     none = Contrast(Measured(None), None, "", None)
     success, returns = one.success or none, one.returns or none
-    numbers = [measured for name in METRICS for measured in _of(result.metrics[name])]
+    numbers = [measured for name in METRICS for measured in _of(result.metric(name))]
     numbers += [
         max((summary["protocol"]["delay_steps"] for summary in summaries), default=None),
         max(alone, default=None),

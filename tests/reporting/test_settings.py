@@ -132,7 +132,7 @@ def test_what_is_not_measured_yet_is_said(tmp_path):
 
 def test_figures_have_a_line_for_every_method(results):
     delays = success_by_delay(results)
-    titles = [axes.get_title() for axes in delays.axes]
+    titles = [axes.get_title(loc="left") for axes in delays.axes]
     assert titles == [
         "the robot holds meanwhile", "the robot continues meanwhile", "the robot holds meanwhile, bump",
         "the robot continues meanwhile, bump",
@@ -141,5 +141,5 @@ def test_figures_have_a_line_for_every_method(results):
     x = [line.get_xdata().tolist() for line in delays.axes[1].lines if len(line.get_xdata()) == 2]
     assert [0.0, 120.0] in x
     severities = success_by_severity(results)
-    assert severities.axes[0].get_title() == "bump"
+    assert severities.axes[0].get_title(loc="left") == "bump"
     assert len(severities.axes[0].containers) == 2
