@@ -40,7 +40,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
                 for method in methods
             }
             _draw(axis, lines, methods)
-        _finish(figure, axes)
+        _finish(figure, axes[::2])
     return figure
 
 
