@@ -20,7 +20,7 @@ PIP := $(PY) -m pip --quiet --disable-pip-version-check
 BUILD := $(PIP) install --no-deps --no-build-isolation
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell campaign bench tables report gallery wheel test lint clean
+.PHONY: help setup train demos eval sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell sweep-clock sweep-conditions campaign bench tables report gallery wheel test lint clean
 
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
@@ -49,7 +49,9 @@ sweep-horizon:  ## Vary predicted and executed steps
 sweep-evaluations:  ## Evaluate with 1 to 10 steps per chunk
 sweep-dwell:  ## Train and evaluate every method on the task where averages fail
 sweep-demonstrations:  ## Train on 25 to 200 demonstrations
-sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell: sweep-%: setup
+sweep-clock:  ## Evaluate object transfer while the clock runs (Table 4)
+sweep-conditions:  ## Evaluate object transfer in a changed world (Table 5)
+sweep-socket sweep-transfer sweep-horizon sweep-evaluations sweep-demonstrations sweep-dwell sweep-clock sweep-conditions: sweep-%: setup
 	$(PY) -m imfvla.train -m +sweep=$* $(ARGS)
 
 campaign: setup  ## Train, evaluate and keep every policy of Tables 1 and 2 and the controls (ARGS="--side-by-side 2")
@@ -64,8 +66,9 @@ tables: setup  ## Make the paper's tables and figures and a page from the run di
 report: setup  ## Make them in experiments/report, with videos and recordings: a folder to send or serve
 	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
-gallery: setup  ## Write pictures of every view of the tasks
+gallery: setup  ## Write pictures of every view of the tasks, and of every condition of an evaluation
 	for task in socket transfer either_arm gate; do $(PY) -m imfvla.gallery task=$$task $(ARGS); done
+	for task in socket transfer; do $(PY) -m imfvla.gallery task=$$task of=conditions size=140; done
 
 wheel: $(INSTALLED)  ## Build dist/imfvla-*.whl, which works from any directory
 	rm -rf build dist

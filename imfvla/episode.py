@@ -34,6 +34,9 @@ class Decision:
     images: Mapping[str, np.ndarray] | None = None  # view -> uint8 (H, W, 3), where the actor looked
     chunk: np.ndarray | None = None  # float32 (Tp, A), where it replanned
     inference_ms: float | None = None  # from numpy observation to numpy chunk, where it replanned
+    jump: float | None = (
+        None  # distance from the last chunk over the steps of both, as a share of the actions' ranges
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,7 @@ class EpisodeResult:
     inference_ms: tuple[float, ...]  # one per replanning
     wall_s: float
     goal: str | None = None  # the task of the episode, where its scene serves several
+    chunk_jump: float | None = None  # mean of the jumps, where its actor told them
 
 
 class Actor(Protocol):

@@ -1,4 +1,7 @@
-"""python -m imfvla.gallery task=socket: a contact sheet of every view, for both outcomes of the hidden choice."""
+"""python -m imfvla.gallery task=socket: a contact sheet of every view, for both outcomes of the hidden choice.
+
+With of=conditions, one of every condition and severity of an evaluation.
+"""
 
 from imfvla.command import begin
 
@@ -14,21 +17,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 
 from imfvla.command.entry import entry_point
+from imfvla.environment import Environment
 from imfvla.episode import Actor
 from imfvla.errors import UserError
-from imfvla.options import build, within
+from imfvla.options import build, one_of, within
+from imfvla.process.progress import Progress
 from imfvla.storage.files import write_together
 
 if TYPE_CHECKING:
     from imfvla.tasks.bimanual_environment import BimanualEnvironment
 
 MOMENTS = (0, 0.25, 0.5, 1)  # of an episode
+VIEWS = ("front",)  # of conditions
+LATER_S = 1.6  # when the expert has reached the objects
 
 
 @dataclass(frozen=True, slots=True)
 class GalleryOptions:
     """conf/gallery.yaml without the task."""
 
+    of: Annotated[str, one_of("views", "conditions")]
     seed: Annotated[int, within(0, 2**31)]
     size: Annotated[int, within(16, 960)]
     directory: str
@@ -37,7 +45,8 @@ class GalleryOptions:
 @entry_point("gallery")
 def main(config: dict[str, Any]) -> None:
     options = build(GalleryOptions, {key: value for key, value in config.items() if key != "task"}, "")
-    for path in write_gallery(config["task"], options.seed, options.size, Path(options.directory)):
+    write = write_gallery if options.of == "views" else write_conditions
+    for path in write(config["task"], options.seed, options.size, Path(options.directory)):
         print(path)
 
 
@@ -67,6 +76,45 @@ def write_gallery(task: Mapping[str, Any], seed: int, size: int, directory: Path
             write_together({path: png(contact_sheet(rows, env.all_views))})
             paths.append(path)
     return paths
+
+
+def write_conditions(task: Mapping[str, Any], seed: int, size: int, directory: Path) -> list[Path]:
+    """Writes one PNG: a row for every condition, and for every severity what the first camera shows a policy at the
+    start and after the expert has worked for a while; returns its path.
+    """
+    from imfvla import tasks
+    from imfvla.conditions import changed
+    from imfvla.config.condition import CONDITIONS, NONE, SEVERITIES
+    from imfvla.figures.contact_sheet import contact_sheet, png
+    from imfvla.tasks.experts import make_expert
+
+    rows = []
+    with Progress("pictures of conditions", 1 + len(CONDITIONS)) as bar:
+        for name in (NONE, *CONDITIONS):
+            pictures = []
+            for severity in SEVERITIES:
+                # One for each, since some conditions change the simulation.
+                env = tasks.load(task["name"], variant=task["variant"], image_size=(size, size), views=VIEWS)
+                world = changed(env, name, None if name == NONE else severity)
+                expert = make_expert(task["name"], **task["expert"])
+                pictures += _start_and_later(world, expert, seed)
+                env.close()
+            rows.append((name, pictures))
+            bar.advance(name)
+    columns = [f"{severity}, {moment}" for severity in SEVERITIES for moment in ("start", f"{LATER_S:g} s")]
+    path = directory / f"{task['name']}-{task['variant']}-seed{seed}-conditions.png"
+    directory.mkdir(parents=True, exist_ok=True)
+    write_together({path: png(contact_sheet(rows, columns))})
+    return [path]
+
+
+def _start_and_later(env: Environment, expert: Actor, seed: int) -> list[np.ndarray]:
+    env.reset(seed)
+    expert.reset(env, seed)
+    pictures = [env.look()[VIEWS[0]]]
+    for step in range(round(LATER_S * env.robot.control_hz)):
+        env.step(expert.act(env, env.state(), step).executed)
+    return [*pictures, env.look()[VIEWS[0]]]
 
 
 def _both_ways(

@@ -132,6 +132,7 @@ class KnownPolicy:
         self.image_size = (self.robot.cameras[0].height, self.robot.cameras[0].width)
         self.seen: list[np.ndarray] = []
         self.noises: list[np.ndarray] = []
+        self.drawn: list[np.ndarray] = []  # of all candidates
         self.evaluations: list[int] = []
 
     @property
@@ -145,7 +146,7 @@ class KnownPolicy:
         assert device == "cpu"
         return self
 
-    def check_sampling(self, nfe: int, noise_scale: float) -> None:
+    def check_sampling(self, nfe: int, noise_scale: float, noise: str = "fresh") -> None:
         pass
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
@@ -154,6 +155,7 @@ class KnownPolicy:
         assert (obs.state[0, :, 0].numpy() == steps).all()
         self.seen.append(steps)
         self.noises.append(noise[0].numpy().copy())
+        self.drawn.append(noise.numpy().copy())
         self.evaluations.append(nfe)
         rows, _ = self.horizon.action_steps(int(steps[-1]), len(self.actions))
         return torch.from_numpy(self.actions[rows]).unsqueeze(0) + self.noise_scale * noise

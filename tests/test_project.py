@@ -95,7 +95,7 @@ LAYERS = [
     "nn",
     "encoders environment generators",
     "episode",
-    "gymnasium_env reporting tasks",
+    "conditions gymnasium_env reporting tasks",
     "environments recording",
     "sources",
     "robot_of",
@@ -121,7 +121,7 @@ ONLY = {
 SIMULATE = "tasks gymnasium_env"
 WHO_MAY = {  # of the heavy packages
     "torch": "types nn encoders generators data policy training modes rollouts command benchmarks bench deployment",
-    "mujoco": SIMULATE,
+    "mujoco": f"{SIMULATE} conditions",
     "dm_control": SIMULATE,
 }
 

@@ -21,7 +21,7 @@ from imfvla.storage.files import write_together
 
 MAPPING = read_mapping()
 ROWS = {row.name: row for row in MAPPING.rows}
-STEMS = ("table1", "table2", "table3", "dwell", "dwell_compared", "aloha", "others")
+STEMS = ("table1", "table2", "table3", "dwell", "dwell_compared", "table4", "table5", "aloha", "others")
 EXPECTED = Path(__file__).resolve().parent / "expected_tables"
 ANSWERED = ("socket_infer1", "socket_infer2", "socket_ddpm_ph32", "transfer_infer1", "transfer_native_dp")
 
@@ -74,7 +74,7 @@ def test_all_files_are_there(runs, tmp_path, method):
     tables = {f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")}
     assert tables | {"index.html"} == {name for name in found if "/" not in name}
     figures = {name for name in found if name.startswith("figures/")}
-    assert len(figures) == 22
+    assert len(figures) == 26
     assert {
         f"figures/{name}.png" for name in ("figure1_overview", "figure4_ablations", "learning")
     } <= figures

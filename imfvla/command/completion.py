@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
+from imfvla.options import build
 from imfvla.reporting.offline import read_offline
 from imfvla.reporting.runs import evaluations
 from imfvla.robot_of import has_environment
@@ -18,14 +20,6 @@ from imfvla.storage.run_directory import (
     training_steps,
 )
 
-# The keys of `evaluation` under the names that a protocol gives them.
-PROTOCOL_KEYS = (
-    "first_seed",
-    "episodes",
-    "noise_seed",
-    "noise_scale",
-    "device",
-)
 OFFLINE_KEYS = ("noise_seed", "noise_scale", "device")
 
 
@@ -65,7 +59,8 @@ def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> b
             "nfe": list(wanted["nfe"]),
         }
         return offline is not None and kept.items() <= offline["protocol"].items()
-    protocol = {key: wanted[key] for key in PROTOCOL_KEYS} | {"checkpoint_step": step, "max_steps": None}
+    asked = build(EvaluationOptions, wanted, "evaluation").in_protocol()
+    protocol = asked | {"checkpoint_step": step}
     of_protocol = [
         evaluation
         for evaluation in evaluations(run, found)

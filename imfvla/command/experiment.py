@@ -22,7 +22,7 @@ from imfvla.process.gl import select_gl_backend
 from imfvla.reporting.offline_tables import print_offline
 from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
-from imfvla.rollouts.evaluation import evaluate
+from imfvla.rollouts.evaluation import evaluate, refuse_long_delay
 from imfvla.rollouts.offline import evaluate_offline
 from imfvla.sources.collection import check_demonstrations
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
@@ -49,7 +49,10 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     options = checked_options(config)
     is_trained = options.training.steps in run.weight_steps()
     config = with_robot(config)
-    policy = rehearse(config, options.evaluation.nfe, options.evaluation.noise_scale)
+    refuse_long_delay(config, options.evaluation)
+    policy = rehearse(
+        config, options.evaluation.nfe, options.evaluation.noise_scale, options.evaluation.noise
+    )
     if not is_trained:
         _check_source(config)
         if not run.last_state.exists():

@@ -96,7 +96,8 @@ def jobs_of_rows(rows: Sequence[TableRow]) -> list[tuple[str, ...]]:
         wanted = {name: getattr(row.wanted, name) for name in row.wanted.__slots__}
         wanted |= {"checkpoint": row.checkpoint} if row.checkpoint != LAST else {}
         protocol = (f"evaluation.{name}={value}" for name, value in wanted.items())
-        numbers.setdefault((f"+exp={row.experiment}", *row.overrides, *protocol), []).append(row.nfe)
+        evaluated = (*protocol, *row.options("evaluation."))
+        numbers.setdefault((f"+exp={row.experiment}", *row.overrides, *evaluated), []).append(row.nfe)
     return [
         (*job, f"evaluation.nfe=[{','.join(map(str, sorted(counts)))}]") for job, counts in numbers.items()
     ]
@@ -152,7 +153,7 @@ def _jobs_of_file(
     config = loader.load_configuration(config_name, [*places, f"+{GROUP}={name}"], RunMode.RUN)
     where = f"{GROUP}/{name}.yaml"
     read = build(SweepOptions, OmegaConf.to_container(config[GROUP]), where)
-    known = [table.name for table in read_mapping().of_rows]
+    known = [table.name for table in (*read_mapping().of_rows, *read_mapping().of_settings)]
     require({*read.tables} <= {*known}, f"{where}: tables", f"a list from {', '.join(known)}", read.tables)
     rows = [row for table in read.tables for row in read_mapping().of_table(table)]
     return [*jobs_of_rows(rows), *read.jobs]

@@ -15,10 +15,11 @@ from imfvla.figures.learning import learning_curves
 from imfvla.figures.methods import success_by_cost
 from imfvla.figures.overview import method_overview
 from imfvla.figures.reward_latency import reward_latency
+from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.figures.style import render
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
-from imfvla.reporting.mapping import COMPARISONS, TableTitle
+from imfvla.reporting.mapping import COMPARISONS, SETTINGS, TableTitle
 from imfvla.reporting.mapping import Mapping as RowMapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import read_offline
@@ -27,6 +28,7 @@ from imfvla.reporting.page import Picture, page
 from imfvla.reporting.published import published_rows
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import find_runs, key_of
+from imfvla.reporting.settings_table import settings_table
 from imfvla.reporting.table import Table
 from imfvla.reporting.tables import Document, comparison_table, other_table, row_table
 from imfvla.storage.files import write_together
@@ -35,6 +37,14 @@ MAX_HEAT_MAPS = 4
 OF_TABLE = {  # by `figure` of a table: what draws its rows, and what that shows
     "reward_latency": (reward_latency, "average reward against the time of a chunk."),
     "ablations": (ablations, "ablations and rivals."),
+    "success_by_delay": (
+        success_by_delay,
+        "success against the delay of a chunk on a running clock. Bars are 95% intervals.",
+    ),
+    "success_by_severity": (
+        success_by_severity,
+        "success against the severity of each condition. Bars are 95% intervals.",
+    ),
     "success_by_cost": (success_by_cost, "success against the network calls and the time of a chunk."),
 }
 
@@ -77,7 +87,7 @@ def publish(
     """
     sources = Sources(directories)
     answers = [sources.answer(row, mapping) for row in mapping.rows]
-    for table in mapping.of_rows:
+    for table in (*mapping.of_rows, *mapping.of_settings):
         check_equal_protocols([answer for answer in answers if answer.row.table == table.name], table.task)
     results = [Result.of(answer) for answer in answers]
     others = [Result(found) for found in sources.others(answers)]
@@ -120,6 +130,8 @@ def _formats(document: Document) -> dict[str, str]:
 def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> Document:
     if table.of == COMPARISONS:
         return comparison_table(table.title, compare(mapping.of_comparisons(table.name), results))
+    if table.of == SETTINGS:
+        return settings_table(table, results)
     rows = [result for result in results if result.row.table == table.name]
     return row_table(table.title, rows, published=published_rows(table.task))
 
@@ -128,6 +140,11 @@ def _figures(
     mapping: RowMapping, results: Sequence[Result], others: Sequence[Result], method: Mapping[str, Any]
 ) -> dict[str, tuple[str, dict[str, bytes]]]:
     """Caption and files of each figure, by name."""
+    settings = {
+        table: [r for r in results if r.row.table == table.name or r.row.name in table.rows]
+        for table in mapping.of_settings
+    }
+    results = [result for result in results if not result.row.changes]
     every = [*results, *others]
     drawn = {
         "figure1_overview": (
@@ -147,6 +164,10 @@ def _figures(
             rows = [result for result in results if result.row.table == table.name]
             caption = f"Figure {number}. {title[:1].upper()}{title[1:]}: {shows} Bars are 95% intervals."
             drawn[f"figure{number}_{table.figure}"] = (draw(rows), caption)
+    for table, rows in settings.items():
+        if table.figure is not None:
+            draw, shows = OF_TABLE[table.figure]
+            drawn[table.figure] = (draw(rows), f"{table.title}: {shows}")
     drawn |= {
         "evaluations": (
             success_by_evaluations(every),

@@ -6,12 +6,13 @@ from typing import Any
 import torch
 
 from imfvla.config.construction import reason_of
-from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.protocol import FRESH, USUAL_NOISE
 from imfvla.errors import UserError
 from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
 from imfvla.robot_of import has_environment
 from imfvla.rollouts.evaluation import require_device
+from imfvla.rollouts.offline import refuse_rollout_options
 from imfvla.storage.run_directory import step_of
 from imfvla.training.experiment import ExperimentOptions, read_experiment
 from imfvla.training.loop import choose_device
@@ -24,6 +25,7 @@ def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
     training, evaluation = options.training, options.evaluation
     if not has_environment(config):
         part_of(config, "task.held_out")
+        refuse_rollout_options(evaluation)
     paraphrases = part_of(config, "task.paraphrases")
     require(isinstance(paraphrases, bool), "task.paraphrases", "true or false", paraphrases)
     choose_device(training.device)
@@ -39,7 +41,9 @@ def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
     return options
 
 
-def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE) -> Policy:
+def rehearse(
+    config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE, noise: str = FRESH
+) -> Policy:
     """The configured policy, after the losses of its first and last step and a chunk on black pictures.
 
     Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
@@ -47,7 +51,7 @@ def rehearse(config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float =
     try:
         policy = build_unfitted(config).eval()
         for number in nfe:
-            policy.check_sampling(number, noise_scale)
+            policy.check_sampling(number, noise_scale, noise)
         observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Horizon: the only place with index arithmetic between observations, predicted chunks and executed actions."""
+"""Horizon: the index arithmetic between observations and predicted chunks; `rollouts.clock` has that of execution."""
 
 from dataclasses import dataclass
 
@@ -58,11 +58,3 @@ class Horizon:
         steps = np.asarray(step)[..., None] + np.arange(self.pred)
         end = np.asarray(episode_length)[..., None]
         return np.minimum(steps, end - 1), steps < end
-
-    def is_decision(self, step: int) -> bool:
-        """Whether the policy replans at `step` of an episode."""
-        return step % self.exec == 0
-
-    def is_observed(self, step: int) -> bool:
-        """Whether the observation of `step` enters a decision: the steps whose cameras must be rendered."""
-        return (-step) % self.exec < self.obs

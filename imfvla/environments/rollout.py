@@ -79,6 +79,7 @@ def run_episode(
     )
     rewards: list[float] = []
     inference_ms: list[float] = []
+    jumps: list[float] = []
     first_step_of_stage = [-1] * len(env.stages)
     outcome = Outcome(reward=0.0, stage=0, success=False, ended=False)
     failure = None
@@ -100,6 +101,8 @@ def run_episode(
             rewards.append(float(outcome.reward))
             if decision.inference_ms is not None:
                 inference_ms.append(float(decision.inference_ms))
+            if decision.jump is not None:
+                jumps.append(decision.jump)
             for reached in range(outcome.stage):
                 if first_step_of_stage[reached] < 0:
                     first_step_of_stage[reached] = index
@@ -124,6 +127,7 @@ def run_episode(
             inference_ms=tuple(inference_ms),
             wall_s=time.perf_counter() - began,
             goal=env.goal,
+            chunk_jump=float(np.mean(jumps)) if jumps else None,
         )
         for sink in sinks:
             sink.end(result)

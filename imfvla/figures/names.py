@@ -8,7 +8,7 @@ from imfvla.reporting.results import Result
 from imfvla.reporting.runs import Evaluation
 
 USUAL = "as in the tables"
-CHANGES = {"task.expert.modes=1": "unimodal demonstrations"}
+CHANGES = {"task.expert.modes=1": "unimodal demonstrations", "noise 0": "chunks from no noise"}
 # of a row's setting, what is no part of a policy: the NFE, and the paper's own steps of training
 NOT_TRAINED = re.compile(r"infer\d+|\d+k|step\d+")
 
@@ -23,11 +23,9 @@ def training_of(evaluation: Evaluation) -> tuple[str, list[str]]:
 
 
 def policy_of(evaluation: Evaluation) -> tuple[str, str]:
-    """As `training_of`, with an unusual noise among the changes; USUAL where there are none."""
+    """As `training_of`, with what was unusual in the evaluation among the changes; USUAL where there are none."""
     name, changes = training_of(evaluation)
-    if not evaluation.is_usual:
-        scale = evaluation.noise_scale
-        changes = [*changes, "chunks from no noise" if scale == 0 else f"noise scaled by {scale:g}"]
+    changes += [CHANGES.get(text, text) for text in evaluation.unusual]
     return name, ", ".join(changes) or USUAL
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from imfvla.config.construction import construct, reason_of
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.protocol import FRESH, ROLLED, USUAL_NOISE, ZERO
 from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
@@ -80,9 +80,15 @@ class Policy(nn.Module):
         loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
         return loss.mean(), logs
 
-    def check_sampling(self, nfe: int, noise_scale: float) -> None:
-        """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale."""
+    def check_sampling(self, nfe: int, noise_scale: float, noise: str = FRESH) -> None:
+        """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale and kind."""
         self.generator.check_nfe(nfe)
+        if noise in (ZERO, ROLLED) and draws_noise(self.generator, nfe):
+            raise UserError(
+                f"noise must be {FRESH} or held with nfe={nfe}, found {noise}: with so many evaluations "
+                f"{type(self.generator).__name__} draws noise in later steps too, from the first one as a whole. Take "
+                "another noise or another nfe."
+            )
         if noise_scale != USUAL_NOISE and draws_noise(self.generator, nfe):
             raise UserError(
                 f"noise_scale must be {USUAL_NOISE:g} with nfe={nfe}, found {noise_scale:g}: with so many evaluations "

@@ -86,11 +86,13 @@ class Sources:
             other.nfe
             for other in mapping.rows
             if (other.experiment, other.run, other.checkpoint) == (row.experiment, row.run, LAST)
+            and not other.changes
         }
         overrides = "".join(f" {override}" for override in row.overrides)
         counts = ",".join(map(str, sorted(last or {row.nfe})))
         train = f"python -m imfvla.train +exp={row.experiment}{overrides} 'evaluation.nfe=[{counts}]'"
-        return train if row.checkpoint == LAST else f"{train} && {_evaluate(row, Path(directory))}"
+        is_usual = row.checkpoint == LAST and not row.changes
+        return train if is_usual else f"{train} && {_evaluate(row, Path(directory))}"
 
     def others(self, answers: Sequence[Answer]) -> list[list[Evaluated]]:
         """Evaluations of the reporting band that fill no row; those of all training seeds together.
@@ -133,9 +135,9 @@ def check_equal_protocols(answers: Sequence[Answer], task: str) -> None:
 
 
 def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
-    """Whether it is of the row's policy, weights and NFE, with noise as in training."""
+    """Whether it is of the row's policy, weights and NFE, with its noise, clock and condition."""
     policy = (evaluation.experiment, evaluation.key, evaluation.nfe)
-    if policy != (row.experiment, row.run, row.nfe) or not evaluation.is_usual:
+    if policy != (row.experiment, row.run, row.nfe) or evaluation.changes != dict(row.changes):
         return False
     return evaluation.summary["checkpoint_step"] == row.step(evaluation.training_steps)
 
@@ -202,7 +204,7 @@ def _evaluate(row: TableRow, run: Path) -> str:
         parts.append(f"noise_seed={wanted.noise_seed}")
     if wanted.device != "cpu":
         parts.append(f"device={wanted.device}")
-    return " ".join(parts)
+    return " ".join([*parts, *row.options()])
 
 
 def _identity(evaluation: Evaluation) -> tuple:

@@ -12,15 +12,17 @@ from imfvla.config.assets import folder
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of, require, suggestion
 from imfvla.reporting.mapping_file import entries, load, named, place_of, plain
-from imfvla.reporting.paper import PaperComparison, PaperRow, paper_comparisons, paper_numbers, paper_rows
-from imfvla.storage.run_directory import LAST, step_of
-from imfvla.storage.run_names import run_key, run_name
+from imfvla.reporting.mapping_row import TableRow, Wanted
+from imfvla.reporting.paper import PaperComparison, paper_comparisons, paper_numbers, paper_rows
+from imfvla.reporting.settings import rows_of_settings
+from imfvla.storage.run_directory import LAST
 
 PATH = folder("experiments") / "tables.yaml"
 OPERATIONS = ("ratio", "inverse_ratio", "difference")
 COMPARED = ("avg_return", "success_episodes", "inference_ms_mean", "inference_fps")
-ROWS, COMPARISONS = "rows", "comparisons"
-FIGURES = ("reward_latency", "ablations", "success_by_cost")  # of a table's rows
+ROWS, COMPARISONS, SETTINGS = "rows", "comparisons", "settings"
+# of a table's rows
+FIGURES = ("reward_latency", "ablations", "success_by_cost", "success_by_delay", "success_by_severity")
 SECTIONS = ("evaluation", "tasks", "tables")
 PRINTED = Limit("the number of a table in experiments/paper", lambda number: number in paper_numbers())
 
@@ -36,57 +38,19 @@ class TaskTitle:
 
 @dataclass(frozen=True, slots=True)
 class TableTitle:
-    """A table of rows of one task, or of comparisons between rows, which are corrected together.
+    """A table of rows of one task, of `rows` of others in other settings, or of comparisons, which are corrected together.
 
     `printed` is its number in the paper, None where the paper has no such table; `figure` draws its rows.
     """
 
     name: str
     title: str
-    of: Annotated[str, one_of(ROWS, COMPARISONS)] = ROWS
+    of: Annotated[str, one_of(ROWS, COMPARISONS, SETTINGS)] = ROWS
     task: str | None = None
     printed: Annotated[int, PRINTED] | None = None
     figure: Annotated[str, one_of(*FIGURES)] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """The evaluation that a row is taken from: whole episodes from consecutive seeds."""
-
-    first_seed: int
-    episodes: int
-    noise_seed: int
-    device: str
-
-
-@dataclass(frozen=True, slots=True)
-class TableRow:
-    """A row of a table. `paper` is the printed row, None for a row that the paper does not have."""
-
-    name: str
-    table: str  # name of its table
-    experiment: str  # of conf/exp
-    overrides: tuple[str, ...]
-    nfe: int
-    checkpoint: str  # "last", or a share such as "1/3" of the training steps
-    wanted: Wanted
-    method: str
-    setting: str
-    paper: PaperRow | None
-    where: str  # file and line, for messages
-
-    @property
-    def run(self) -> str:
-        """Name of the run directory below that of the experiment, its seed apart; "" for "default"."""
-        return run_key(run_name(self.overrides))
-
-    @property
-    def label(self) -> str:
-        return f"{self.method} ({self.setting})"
-
-    def step(self, steps: int) -> int:
-        """The step of the row's weights in a training of so many steps."""
-        return step_of(steps, self.checkpoint)
+    rows: tuple[str, ...] = ()
+    sweep: str | None = None  # of conf/sweep, which fills a table of settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +81,10 @@ class Mapping:
     def of_rows(self) -> tuple[TableTitle, ...]:
         return tuple(table for table in self.tables if table.of == ROWS)
 
+    @property
+    def of_settings(self) -> tuple[TableTitle, ...]:
+        return tuple(table for table in self.tables if table.of == SETTINGS)
+
     def table(self, name: str) -> TableTitle:
         return next(table for table in self.tables if table.name == name)
 
@@ -133,7 +101,8 @@ class Mapping:
     def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
         """The first row of an experiment, a `run_key` and an NFE, whatever its checkpoint."""
         wanted = (experiment, run, nfe)
-        return next((row for row in self.rows if (row.experiment, row.run, row.nfe) == wanted), None)
+        usual = (row for row in self.rows if not row.changes)
+        return next((row for row in usual if (row.experiment, row.run, row.nfe) == wanted), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,8 +142,13 @@ def read_mapping(path: Path = PATH) -> Mapping:
         if table.of == ROWS
         for number, entry in enumerate(entries(content, table.name, path), 1)
     ]
-    _check_rows(rows, tables, path)
     by_name = {row.name: row for row in rows}
+    for table in tables:
+        if table.of == SETTINGS:
+            rows += rows_of_settings(
+                entries(content, table.name, path), table.name, table.rows, by_name, path
+            )
+    _check_rows(rows, tables, path)
     comparisons = []
     for table in tables:
         if table.of == COMPARISONS:
@@ -218,9 +192,15 @@ def _check_tables(tables: Sequence[TableTitle], tasks: Sequence[TaskTitle], path
     known = {task.name: task for task in tasks}
     for table in tables:
         where = f"{path}: tables.{table.name}"
-        if table.of == ROWS:
+        if table.of != COMPARISONS:
             require(table.task is not None, f"{where}.task", f"one of {', '.join(known)}", table.task)
             named(table.task, known, f"{where}: unknown task")
+            wanted = "the names of rows" if table.of == SETTINGS else "absent but with of: settings"
+            require(bool(table.rows) == (table.of == SETTINGS), f"{where}.rows", wanted, list(table.rows))
+            wanted = (
+                "the name of a file in conf/sweep" if table.of == SETTINGS else "absent but with of: settings"
+            )
+            require(bool(table.sweep) == (table.of == SETTINGS), f"{where}.sweep", wanted, table.sweep)
 
 
 def _row(entry: dict[str, Any], table: TableTitle, number: int, path: Path, default: Wanted) -> TableRow:

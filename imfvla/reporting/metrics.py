@@ -80,6 +80,11 @@ def inference_counts(episodes: Episodes) -> np.ndarray:
     return np.array([len(row[TIMING]["inference_ms"]) for row in episodes], int)
 
 
+def chunk_jumps(episodes: Episodes) -> np.ndarray:
+    """Mean distance between consecutive chunks in the episodes that have it, as a share of the actions' ranges."""
+    return np.array([row["chunk_jump"] for row in episodes if "chunk_jump" in row], float)
+
+
 def plain(statistic: Callable[[np.ndarray], Any], column: Callable[[Episodes], np.ndarray]):
     """`Metric.of`: a statistic of a column; None where that is empty."""
 
@@ -139,6 +144,7 @@ METRICS = (
     Metric("inference_ms_p95", "latency_ms_p95", plain(lambda ms: np.percentile(ms, 95), inference_times), "p95 ms", 3),
     Metric("inference_fps", "inference_fps", plain(lambda ms: 1000 / ms.mean(), inference_times), "Inf. FPS", 2,
            estimate=rate, printed="inference_fps", printed_digits=3),
+    Metric("chunk_jump", "chunk_jump", plain(np.mean, chunk_jumps), data_digits=6),
     Metric("control_fps", "control_fps", control_rate, "Control FPS", 0),
 )  # fmt: skip
 

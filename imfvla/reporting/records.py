@@ -6,9 +6,10 @@ Keys that are not listed may be there too, with plain values: another version of
 from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
-from imfvla.config.protocol import MAX_EPISODES
-from imfvla.options import above, at_most, of_length, within
-from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Name, Seed, Step
+from imfvla.config.condition import SEVERITIES
+from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE, MOST_CANDIDATES, NOISES
+from imfvla.options import above, at_most, of_length, one_of, within
+from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
 
 MOST_STEPS = 10**7  # control steps of an episode
 MOST_STAGES = 100
@@ -41,6 +42,7 @@ class Row(TypedDict):
     first_step_of_stage: Annotated[list[Annotated[int, within(-1, MOST_STEPS)]], at_most(MOST_STAGES)]
     failure: Name | None
     goal: NotRequired[Name]
+    chunk_jump: NotRequired[Annotated[float, within(0, LARGEST)]]
     timing: Timing
 
 
@@ -63,6 +65,33 @@ class ProtocolRecord(TypedDict):
     episodes: NotRequired[Count]
     max_steps: NotRequired[Annotated[int, within(1, MOST_STEPS)] | None]
     device: NotRequired[Name]
+    # As `config.protocol.USUAL` where it is older than them.
+    clock: NotRequired[Annotated[str, one_of(*CLOCKS)]]
+    delay_ms: NotRequired[Annotated[int | float | str, DELAY]]
+    delay_steps: NotRequired[Annotated[int, within(0, MOST_STEPS)]]
+    meanwhile: NotRequired[Annotated[str, one_of(*MEANWHILE)]]
+    noise: NotRequired[Annotated[str, one_of(*NOISES)]]
+    candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
+    condition: NotRequired[Name]
+    severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
+
+
+class Latency(TypedDict):
+    """The time of a chunk, taken alone: see `rollouts.latency`."""
+
+    weights: NotRequired[Name]
+    nfe: NotRequired[Nfe]
+    candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
+    device: NotRequired[Name]
+    machine: NotRequired[Machine]
+    median_ms: Positive
+    p95_ms: Positive
+    calls: Count
+    at: Name
+    load: Duration  # mean number of waiting processes in the minute before
+
+
+Latencies = Annotated[list[Latency], at_most(1000)]  # latency.json
 
 
 class Summary(TypedDict):
@@ -91,5 +120,6 @@ class Summary(TypedDict):
     stages: NotRequired[Annotated[list[Label], at_most(MOST_STAGES)]]
     seeds: Annotated[list[Seed], of_length(2)]
     protocol: ProtocolRecord
+    latency_alone: NotRequired[Latency]  # what a measured delay is
     recordings: NotRequired[Annotated[Mapping[str, Recording], at_most(100)]]
     fingerprint: Fingerprint

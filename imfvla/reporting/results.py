@@ -11,6 +11,8 @@ from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.records import Row
 
+BY_NAME = {metric.name: metric for metric in METRICS}
+
 
 class Result:
     """The results of a policy at one NFE: of a row of the tables, or of a policy outside of them.
@@ -21,6 +23,7 @@ class Result:
     def __init__(self, evaluated: Sequence[Evaluated], answer: Answer | None = None) -> None:
         assert evaluated or answer
         self.evaluated, self.answer = tuple(evaluated), answer
+        self._measured: dict[str, Measured] = {}
 
     @classmethod
     def of(cls, answer: Answer) -> "Result":
@@ -75,13 +78,17 @@ class Result:
         """Of all training seeds, one after the other."""
         return [row for found in self.evaluated for row in found.episodes]
 
-    @cached_property
+    @property
     def metrics(self) -> dict[str, Measured]:
         """By name: every one of `METRICS`."""
-        if self.is_missing:
-            return {metric.name: Measured(None) for metric in METRICS}
-        by_seed = [found.episodes for found in self.evaluated]
-        return {metric.name: metric.measured(by_seed) for metric in METRICS}
+        return {name: self.metric(name) for name in BY_NAME}
+
+    def metric(self, name: str) -> Measured:
+        """One of `METRICS`; intervals take time, so that none is computed which nobody asks for."""
+        if name not in self._measured:
+            by_seed = [found.episodes for found in self.evaluated]
+            self._measured[name] = Measured(None) if self.is_missing else BY_NAME[name].measured(by_seed)
+        return self._measured[name]
 
     @cached_property
     def paper_success_share(self) -> Measured:

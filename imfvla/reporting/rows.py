@@ -20,6 +20,7 @@ def row_of(result: EpisodeResult) -> Row:
         "first_step_of_stage": list(result.first_step_of_stage),
         "failure": result.failure,
         **({"goal": result.goal} if result.goal else {}),
+        **({} if result.chunk_jump is None else {"chunk_jump": round(result.chunk_jump, 9)}),
         TIMING: {
             "wall_s": round(result.wall_s, 6),
             "inference_ms": [round(value, 3) for value in result.inference_ms],

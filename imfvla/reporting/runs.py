@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL_NOISE, as_recorded
+from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL, as_recorded, unusual
 from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.reporting.mapping import TableRow, read_mapping
@@ -45,8 +45,20 @@ class Evaluation:
 
     @property
     def is_usual(self) -> bool:
-        """Whether chunks started from noise as in training, as in all rows of the tables."""
-        return self.noise_scale == USUAL_NOISE
+        """Whether noise, clock and world were as in all rows of the tables."""
+        return not self.changes
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """What was not, as keys and values of the protocol."""
+        protocol = self.summary["protocol"]
+        asked = (key for key in USUAL if key != "delay_steps")  # which follows from the others
+        return {key: protocol[key] for key in asked if protocol[key] != USUAL[key]}
+
+    @property
+    def unusual(self) -> tuple[str, ...]:
+        """What was not, in words."""
+        return unusual(self.summary["protocol"])
 
     @property
     def key(self) -> str:
@@ -60,7 +72,7 @@ class Evaluation:
 
     @property
     def label(self) -> str:
-        return self.policy if self.is_usual else f"{self.policy}, noise {self.noise_scale:g}"
+        return ", ".join((self.policy, *self.unusual))
 
     @property
     def training_seed(self) -> int:

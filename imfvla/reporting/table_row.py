@@ -16,7 +16,7 @@ from imfvla.storage.files import write_json, write_text
 from imfvla.storage.run_directory import LAST, RunDirectory
 
 BEHIND = [metric.name for metric in SHOWN].index("success_episodes") + 1  # where its interval has a column
-IN_JSON = ("episodes", *(metric.name for metric in METRICS), "success_interval", "failures")
+IN_JSON = ("episodes", *(metric.name for metric in METRICS), "success_interval", "failures", "latency_alone")
 COLUMNS = ("nfe", "source", *TITLES[:BEHIND], "95% interval", *TITLES[BEHIND:])
 
 
@@ -52,6 +52,13 @@ def table_of(found: Sequence[Evaluation]) -> Table:
     for evaluation in found:
         if paper_of(evaluation) and evaluation.row.checkpoint != LAST:
             note += f" The paper's row at NFE {evaluation.nfe} is from {evaluation.row.checkpoint} of its training."
+        if evaluation.unusual:
+            note += f" NFE {evaluation.nfe}: {', '.join(evaluation.unusual)}."
+        if taken := evaluation.summary.get("latency_alone"):
+            note += (
+                f" NFE {evaluation.nfe}: a chunk takes {taken['median_ms']:.1f} ms (p95 {taken['p95_ms']:.1f}) alone, "
+                f"measured before the rollouts at a load of {taken['load']:.1f}, {taken['at']}."
+            )
         for goal, (successes, episodes) in evaluation.summary.get("success_of_goal", {}).items():
             note += f" NFE {evaluation.nfe}, asked for {goal}: {successes}/{episodes}."
         for label, count in evaluation.summary["failures"].items():
@@ -97,6 +104,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "nfe": evaluation.nfe,
         "checkpoint_step": evaluation.summary["checkpoint_step"],
         "seeds": evaluation.summary["seeds"],
+        "unusual": list(evaluation.unusual),
         "ours": {key: evaluation.summary.get(key) for key in IN_JSON},
         "paper": asdict(paper) if paper else None,
     }

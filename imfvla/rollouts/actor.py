@@ -10,14 +10,15 @@ import numpy as np
 import torch
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import USUAL_NOISE
+from imfvla.config.protocol import CONTINUE, FRESH, USUAL_NOISE
 from imfvla.data.resample import resample
 from imfvla.environment import Environment
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.episode import Decision
 from imfvla.policy import Policy
-from imfvla.policy.noise import chunk_noise
+from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.ensemble import TemporalEnsemble
+from imfvla.rollouts.noise import ReplanningNoise, distances
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.types import Observation, tokenize
 
@@ -27,11 +28,15 @@ FAR = 10.0
 
 
 class ChunkActor:
-    """Plays a policy in closed loop: an `episode.Actor` that replans every `horizon.exec` control steps.
+    """Plays a policy in closed loop: an `episode.Actor` that looks and replans when its clock says so.
 
+    Without a clock, the world waits for every chunk, and the policy replans every `horizon.exec` control steps.
     Cameras are rendered only at the steps that enter a decision. The noise of replanning k in the
     episode `seed` is drawn from `SeedSequence([noise_seed, seed, k])` alone, so all policies with chunks of
-    the same shape see the same noise. It is multiplied by `noise_scale`.
+    the same shape see the same noise. It is multiplied by `noise_scale`; `noise` says what becomes of it from one
+    replanning to the next (`rollouts.noise`). Of several `candidates`, sampled as one batch from one encoding, the one
+    is taken that is nearest to the last chunk over the steps that both cover (backward coherence of arXiv 2408.17355).
+    With `tells_jumps`, decisions say how far that is, root-mean-square in shares of the actions' ranges.
     """
 
     def __init__(
@@ -43,11 +48,19 @@ class ChunkActor:
         device: torch.device | str = "cpu",
         *,
         noise_scale: float = USUAL_NOISE,
+        noise: str = FRESH,
+        candidates: int = 1,
+        clock: Clock | None = None,
+        tells_jumps: bool = False,
     ) -> None:
         self._policy = policy.eval()
         self._horizon = horizon
+        self._clock = clock or Clock(horizon)
         self._nfe = nfe
-        self._noise_seed, self._noise_scale = noise_seed, noise_scale
+        self._noise = ReplanningNoise(
+            policy.noise_shape, noise_seed, kind=noise, scale=noise_scale, candidates=candidates
+        )
+        self._tells_jumps = tells_jumps
         self._device = torch.device(device)
 
     def reset(self, env: Environment, seed: int) -> None:
@@ -66,46 +79,83 @@ class ChunkActor:
         self._minimum = np.array(env.robot.action_min, np.float32)
         self._maximum = np.array(env.robot.action_max, np.float32)
         self._instruction = torch.from_numpy(tokenize(env.instruction)).unsqueeze(0).to(self._device)
-        self._seed = seed
+        self._noise.reset(seed)
+        self._last: tuple[int, np.ndarray] | None = None  # decision and chunk before this one
         self._images: dict[int, list[np.ndarray]] = {}
         self._states: dict[int, np.ndarray] = {}
+        self._coming: tuple[int, np.ndarray] | None = None  # decision and chunk that is not there yet
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
 
     def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
-        """The action of `step`; looks and replans where the horizon says so.
+        """The action of `step`; looks and replans where the clock says so.
 
         Raises:
           ActionError: the part of the chunk that would be executed is not finite, or far outside the limits.
         """
-        images = chunk = inference_ms = None
-        if self._horizon.is_observed(step):
+        images = chunk = inference_ms = jump = None
+        self._receive(step)
+        if self._clock.is_observed(step):
             images = env.look()
             self._images[step] = [images[view] for view in self._policy.views]
             self._states[step] = state
-        if self._horizon.is_decision(step):
+        if self._clock.is_decision(step):
             steps = self._horizon.observed_steps(step)
             self._images = {s: self._images[s] for s in steps}
             self._states = {s: self._states[s] for s in steps}
             chunk, inference_ms = self.plan(
-                [self._images[s] for s in steps], [self._states[s] for s in steps], step // self._horizon.exec
+                [self._images[s] for s in steps],
+                [self._states[s] for s in steps],
+                self._clock.number(step),
+                0 if self._last is None else step - self._last[0],
             )
-            self._check(chunk[: self._horizon.exec])
-            self._chunk, self._decided_at = chunk, step
+            self._check(chunk[self._clock.executed(step)])
+            jump = self._jump(chunk, step) if self._tells_jumps else None
+            self._last = (step, chunk)
+            self._coming = (step, chunk)
+            self._receive(step)
+        if self._coming is None or self._clock.meanwhile == CONTINUE:
+            self._target = self._planned(step)
+        action = self._target
+        return Decision(action, action, images, chunk, inference_ms, jump)
+
+    def _jump(self, chunk: np.ndarray, step: int) -> float | None:
+        """How far a chunk is from the last one; None where there is none, or none that reaches so far."""
+        if self._last is None:
+            return None
+        (found,) = self._distances(chunk[None], step - self._last[0])
+        return None if np.isnan(found) else float(found)
+
+    def _distances(self, chunks: np.ndarray, advance: int) -> np.ndarray:
+        return distances(chunks, self._last[1], advance, self._maximum - self._minimum)
+
+    def _receive(self, step: int) -> None:
+        """Takes the chunk that is there from `step` on, if any."""
+        if self._coming is not None and self._clock.arrival(self._coming[0]) == step:
+            self._decided_at, self._chunk = self._coming
+            self._coming = None
+            if self._ensemble is not None:
+                self._ensemble.add(self._decided_at, self._chunk)
+
+    def _planned(self, step: int) -> np.ndarray:
+        """What the present chunk, or all that cover `step`, say: float32 (A,) within the limits."""
         if self._ensemble is None:
-            action = self._chunk[step - self._decided_at]
+            action = self._chunk[self._clock.entry(step, self._decided_at)]
         else:
-            self._ensemble.add(step, self._chunk)
             action = self._ensemble.action(step)
-        action = np.clip(action, self._minimum, self._maximum).astype(np.float32)
-        return Decision(action=action, executed=action, images=images, chunk=chunk, inference_ms=inference_ms)
+        return np.clip(action, self._minimum, self._maximum).astype(np.float32)
 
     @torch.inference_mode()
     def plan(
-        self, images: Sequence[Sequence[np.ndarray]], states: Sequence[np.ndarray], replanning: int
+        self,
+        images: Sequence[Sequence[np.ndarray]],
+        states: Sequence[np.ndarray],
+        replanning: int,
+        advance: int = 0,
     ) -> tuple[np.ndarray, float]:
         """From the V pictures of each of To steps, uint8 (H, W, 3) of any size, and states, float32 (S,), to a chunk.
 
+        `advance` is the number of steps since the last decision.
         Returns the chunk, float32 (Tp, A), and the time from these arrays to that one [ms].
         """
         began = time.perf_counter()
@@ -117,10 +167,13 @@ class ChunkActor:
             state=torch.from_numpy(np.stack(states)).unsqueeze(0).to(self._device),
             instruction=self._instruction,
         )
-        place = (self._noise_seed, self._seed, replanning)
-        noise = self._noise_scale * chunk_noise(self._policy.noise_shape, [place])
-        chunk = self._policy.predict(observation, noise.to(self._device), self._nfe)
-        answer = chunk[0].float().cpu().numpy()  # waits for an accelerator
+        noise = self._noise.draw(replanning, advance)
+        chunks = self._policy.predict(observation, noise.to(self._device), self._nfe)
+        answers = chunks.float().cpu().numpy()  # waits for an accelerator
+        chosen = 0
+        if len(answers) > 1 and self._last is not None:
+            chosen = int(np.argmin(np.nan_to_num(self._distances(answers, advance), nan=0.0)))
+        answer = answers[chosen]
         return answer, 1e3 * (time.perf_counter() - began)
 
     def _check(self, actions: np.ndarray) -> None:

@@ -1,21 +1,35 @@
 """Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import EvaluationOptions, Protocol
 from imfvla.errors import UserError
-from imfvla.options import require
+from imfvla.options import build as build_options
+from imfvla.options import part_of, require
 from imfvla.process.progress import Progress
 from imfvla.process.workers import Here, Pool, worker_pool
 from imfvla.reporting.metrics import summarise
-from imfvla.reporting.records import Row
+from imfvla.reporting.records import Latency, Row
+from imfvla.robot_of import robot_of
+from imfvla.rollouts.clock import delay_steps
+from imfvla.rollouts.latency import latency_of
 from imfvla.rollouts.rollout_log import RolloutLog
-from imfvla.rollouts.workbench import Build, Job, describe_world, load_workbench, record, roll_out
+from imfvla.rollouts.workbench import (
+    Build,
+    Job,
+    describe_world,
+    load_workbench,
+    measure_alone,
+    record,
+    roll_out,
+)
 from imfvla.storage.documents import read_json
 from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory, flatten
@@ -23,6 +37,7 @@ from imfvla.storage.trained_config import DIGEST, digest_of_config, refuse_chang
 
 REQUIRED_KEYS = ("name", "task.name", "observation.views", "observation.image_size")
 USUAL_VARIANT = "default"  # of a task that has no other
+log = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -57,32 +72,22 @@ def evaluate(
         refuse_other_config(config, run.path, path, _config_digest(path, run.path))
     config_digest = digest_of_config(config)
     count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
+    protocols = [
+        Protocol(
+            task=config["task"]["name"],
+            variant=config["task"].get("variant", USUAL_VARIANT),
+            checkpoint_step=step,
+            weights=digest,
+            nfe=number,
+            **options.in_protocol(),
+        )
+        for number in options.nfe
+    ]
+    timed = [_timed(run, config, protocol, options, build) for protocol in protocols]
     summaries = []
     with worker_pool(count, options.episode_timeout_s) as run_all:
-        for number in options.nfe:
-            protocol = Protocol(
-                task=config["task"]["name"],
-                variant=config["task"].get("variant", USUAL_VARIANT),
-                checkpoint_step=step,
-                weights=digest,
-                nfe=number,
-                noise_seed=options.noise_seed,
-                noise_scale=options.noise_scale,
-                first_seed=options.first_seed,
-                episodes=options.episodes,
-                max_steps=options.max_steps,
-                device=options.device,
-            )
-            job = Job(
-                build,
-                run.path,
-                step,
-                number,
-                options.noise_seed,
-                options.noise_scale,
-                options.max_steps,
-                options.device,
-            )
+        for protocol, latency in timed:
+            job = Job(build, run.path, protocol)
             name = protocol.name(run.weight_steps()[-1])
             with RolloutLog(
                 run.rollouts(name), asdict(protocol), config_digest=config_digest, overwrite=options.overwrite
@@ -97,11 +102,12 @@ def evaluate(
                         **summarise(rows),
                         "name": name,
                         "experiment": config["name"],
-                        "nfe": number,
+                        "nfe": protocol.nfe,
                         "checkpoint_step": step,
                         **({} if world.stages is None else {"stages": list(world.stages)}),
                         "seeds": [protocol.seeds[0], protocol.seeds[-1]],
                         "protocol": asdict(protocol),
+                        **({} if latency is None else {"latency_alone": latency}),
                         "recordings": files,
                         "worker_incidents": run_all.incidents - incidents_before,
                         "fingerprint": fingerprint(threads=1, workers=count, gl_renderer=world.renderer),
@@ -109,6 +115,42 @@ def evaluate(
                     rollouts.finish(rows, summary)
                 summaries.append(rollouts.summary)
     return summaries
+
+
+def refuse_long_delay(config: Mapping[str, Any], options: EvaluationOptions) -> None:
+    """Raises UserError where the policy of a config cannot bear the delay; a measured one is not known yet."""
+    if options.is_running and not options.is_measured:
+        _delay_steps(config, options.delay_ms, options.meanwhile)
+
+
+def _delay_steps(config: Mapping[str, Any], delay_ms: float, meanwhile: str) -> int:
+    horizon = build_options(Horizon, part_of(config, "horizon"), "horizon")
+    return delay_steps(delay_ms, robot_of(config).control_hz, horizon, meanwhile)
+
+
+def _timed(
+    run: RunDirectory,
+    config: Mapping[str, Any],
+    protocol: Protocol,
+    options: EvaluationOptions,
+    build: Build,
+) -> tuple[Protocol, Latency | None]:
+    """The protocol with its delay in control steps, and the latency that was measured for it, alone."""
+    if not options.is_running:
+        return protocol, None
+    if not options.is_measured:
+        return replace(protocol, delay_steps=_delay_steps(config, options.delay_ms, options.meanwhile)), None
+
+    def measure() -> Latency:
+        count = 0 if options.workers == 0 else 1
+        with worker_pool(count, options.episode_timeout_s) as run_alone:
+            (latency,) = run_alone(measure_alone, [(Job(build, run.path, protocol),)])
+        return latency
+
+    latency = latency_of(run, protocol, measure, again=options.overwrite)
+    log.info("a chunk takes %.1f ms alone, at a load of %.1f", latency["median_ms"], latency["load"])
+    steps = _delay_steps(config, latency["median_ms"], options.meanwhile)
+    return replace(protocol, delay_steps=steps), latency
 
 
 def _config_digest(summary: Path, home: Path) -> Any:
@@ -141,7 +183,7 @@ def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: H
     chosen = best_median_worst(rows)
     paths = {label: rollouts.path / f"{label}_seed{row['seed']}.mcap" for label, row in chosen.items()}
     calls = [(job, row, paths[label]) for label, row in chosen.items()]
-    with Progress(f"recording {', '.join(chosen)} of nfe {job.nfe}", len(calls)) as bar:
+    with Progress(f"recording {', '.join(chosen)} of nfe {job.protocol.nfe}", len(calls)) as bar:
         for _ in run_all(record, calls):
             bar.advance()
     return {

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.condition import UNCHANGED
+from imfvla.config.protocol import FRESH, PAUSED, EvaluationOptions
 from imfvla.data import Windows
 from imfvla.data.same_content import refuse_other_content
 from imfvla.errors import UserError
+from imfvla.options import require
 from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
@@ -31,6 +33,13 @@ MOST_COMPARED = 20_000  # of the training episodes, among which the nearest is l
 ROWS = 32  # chunks that are computed together
 
 
+def refuse_rollout_options(options: EvaluationOptions) -> None:
+    """Raises UserError where an option asks for what only an environment has."""
+    for key, usual in (("clock", PAUSED), ("noise", FRESH), ("candidates", 1), ("condition", UNCHANGED)):
+        found = getattr(options, key)
+        require(found == usual, f"evaluation.{key}", "as usual where there is no environment", found)
+
+
 def evaluate_offline(
     run: RunDirectory, config: Mapping[str, Any], options: EvaluationOptions
 ) -> dict[str, Any]:
@@ -41,6 +50,7 @@ def evaluate_offline(
     held-out decisions; steps past an episode's end do not count, and are null where none counts. Raises UserError where
     there are no such weights, and where these were trained with another config or on other data.
     """
+    refuse_rollout_options(options)
     step = run.weights_step(options.checkpoint)
     refuse_changed_config(run, run.config(), step)
     windows = prepare_windows(config, open_source(config))

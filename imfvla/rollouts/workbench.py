@@ -1,20 +1,25 @@
 """What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from imfvla.conditions import changed
+from imfvla.config.condition import NONE
+from imfvla.config.protocol import Protocol, unusual
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
 from imfvla.environments.rollout import run_episode
-from imfvla.reporting.records import Row
+from imfvla.reporting.records import Latency, Row
 from imfvla.reporting.rows import row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.clock import Clock
+from imfvla.rollouts.latency import measure_latency
 from imfvla.storage.run_directory import RunDirectory
 
 VIDEO_HEIGHT = 240  # of a view [px]
@@ -28,12 +33,12 @@ class Job:
 
     build: Build
     run: Path
-    step: int
-    nfe: int
-    noise_seed: int
-    noise_scale: float
-    max_steps: int | None
-    device: str  # of the policy
+    protocol: Protocol
+
+    @property
+    def step(self) -> int:
+        """Of the weights."""
+        return self.protocol.checkpoint_step
 
 
 def load_workbench(run: Path, step: int) -> tuple[Environment, Any]:
@@ -58,8 +63,16 @@ class World:
 
 def describe_world(job: Job) -> World:
     """Of the environment in which episodes are played."""
-    env, _ = _bench(job.build, job.run, job.step)
+    env, _ = _place(job)
     return World(env.renderer(), None if env.goal else env.stages)
+
+
+def measure_alone(job: Job) -> Latency:
+    """The time of a chunk of the job's policy, see `rollouts.latency`."""
+    env, policy = _place(job)
+    with one_thread():
+        actor = actor_of(job.protocol, policy)
+        return measure_latency(env, actor, policy.horizon.obs, policy.views, job.protocol.nfe)
 
 
 def roll_out(job: Job, seed: int) -> dict[str, Any]:
@@ -75,7 +88,7 @@ def record(job: Job, expected: Row, path: Path) -> None:
     """
     from imfvla.recording import McapSink, VideoSink  # imported here: nothing else writes videos
 
-    env, _ = _bench(job.build, job.run, job.step)
+    env, _ = _place(job)
     sinks = [
         McapSink(path, lossless=False),
         VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), height=VIDEO_HEIGHT),
@@ -87,29 +100,67 @@ def record(job: Job, expected: Row, path: Path) -> None:
 
 
 def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
-    env, policy = _bench(job.build, job.run, job.step)
-    policy.check_sampling(job.nfe, job.noise_scale)
-    actor = ChunkActor(
-        policy.to(job.device),
-        policy.horizon,
-        job.nfe,
-        job.noise_seed,
-        job.device,
-        noise_scale=job.noise_scale,
-    )
+    env, policy = _place(job)
+    actor = actor_of(job.protocol, policy)
     config = RunDirectory(job.run).config() if sinks else {}
-    metadata = {"policy": str(config.get("name", "")), "nfe": job.nfe, "checkpoint_step": job.step}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    metadata = {
+        "policy": str(config.get("name", "")),
+        "nfe": job.protocol.nfe,
+        "checkpoint_step": job.step,
+        **({"unusual": said} if (said := ", ".join(unusual(asdict(job.protocol)))) else {}),
+    }
+    with one_thread():
         result = run_episode(
-            env, actor, seed, sinks, kind="rollout", config=config, metadata=metadata, max_steps=job.max_steps
+            env,
+            actor,
+            seed,
+            sinks,
+            kind="rollout",
+            config=config,
+            metadata=metadata,
+            max_steps=job.protocol.max_steps,
         )
-    finally:
-        torch.set_num_threads(threads)
     return row_of(result)
 
 
+def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
+    """A policy at work as a protocol says. Raises UserError where it cannot work so."""
+    policy.check_sampling(protocol.nfe, protocol.noise_scale, protocol.noise)
+    return ChunkActor(
+        policy.to(protocol.device),
+        policy.horizon,
+        protocol.nfe,
+        protocol.noise_seed,
+        protocol.device,
+        noise_scale=protocol.noise_scale,
+        noise=protocol.noise,
+        candidates=protocol.candidates,
+        clock=Clock(policy.horizon, protocol.delay_steps, protocol.meanwhile),
+        tells_jumps=protocol.tells_jumps,
+    )
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch computes with one thread inside this context."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _place(job: Job) -> tuple[Environment, Any]:
+    """Environment and policy of a job, each made once."""
+    protocol = job.protocol
+    return _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+
+
 @lru_cache(maxsize=1)
-def _bench(build: Build, run: Path, step: int) -> tuple[Environment, Any]:
-    return build(run, step)
+def _bench(
+    build: Build, run: Path, step: int, condition: str = NONE, severity: int | None = None
+) -> tuple[Environment, Any]:
+    """An environment for each condition, since some change its simulation."""
+    env, policy = build(run, step)
+    return changed(env, condition, severity), policy

@@ -17,7 +17,7 @@ def run_name(overrides: Sequence[str]) -> str:
     """Directory name that the overrides of a command determine: "default" without any.
 
     Sorted `key=value` pairs joined by commas, without those that only name the run (exp, name) or say how it
-    executes; characters that shells or file systems dislike become "-". Options of a source that are long together are
+    executes or is evaluated; characters that shells or file systems dislike become "-". Options of a source that are long together are
     a digest behind its name, as in "demos=ros2-1f3a97c2". What is long without the training seed ends with a digest,
     and the seed follows.
     """
@@ -73,5 +73,5 @@ def _is_seed(part: str) -> bool:
 
 
 def _is_execution_key(key: str) -> bool:
-    is_name = key in ("exp", "name") or key.startswith(("hydra.", "hydra/"))
+    is_name = key in ("exp", "name", "condition") or key.startswith(("hydra.", "hydra/"))
     return is_name or any(key == known or key.startswith(f"{known}.") for known in EXECUTION_KEYS)

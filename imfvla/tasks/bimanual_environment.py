@@ -13,6 +13,7 @@ from imfvla.options import build
 from imfvla.tasks.bimanual import BimanualTask
 from imfvla.tasks.bimanual_robot import ALL_VIEWS, CONTROL_HZ, TIME_LIMIT_STEPS, bimanual_robot
 from imfvla.tasks.catalogue import text_for
+from imfvla.tasks.distractors import Shape, add_to_scene, draw_shapes
 from imfvla.tasks.scene import CAMERAS
 
 
@@ -33,6 +34,7 @@ class BimanualEnvironment:
         self.views, self.image_size = seen.views, seen.image_size
         self.task = task
         self._cameras: dict[tuple[str, int, int], engine.Camera] = {}
+        self._distractors: tuple[Shape, ...] = ()
         self._start_digest = ""
         self._num_steps = self._highest = 0
         self._world = composer.Environment(
@@ -84,6 +86,7 @@ class BimanualEnvironment:
         self._world.random_state.set_state(self.task.begin(seed).get_state())
         self._world.reset()
         self._num_steps = self._highest = 0
+        self._distractors = ()
         start = np.round(np.asarray(self.physics.data.qpos), 9) + 0.0
         self._start_digest = hashlib.sha256(start.tobytes()).hexdigest()[:16]
 
@@ -130,8 +133,19 @@ class BimanualEnvironment:
         key = (view, height, width)
         if key not in self._cameras:
             bimanual_robot((view,), (height, width))  # refuses a view that there is not
-            self._cameras[key] = engine.Camera(self.physics, height, width, CAMERAS[view])
+            self._cameras[key] = engine.Camera(
+                self.physics,
+                height,
+                width,
+                CAMERAS[view],
+                scene_callback=lambda _, scene: add_to_scene(self._distractors, scene),
+            )
         return self._cameras[key].render().copy()
+
+    def distract(self, count: int, rng: np.random.Generator) -> None:
+        """Shows so many objects on the table that nothing can touch, until the next reset."""
+        lying = [self.task.prop_pose(self.physics, name).position[:2] for name in self.task.props]
+        self._distractors = draw_shapes(count, rng, lying)
 
     def scene(self) -> mjcf.Physics:
         """The simulator's bodies, see `environment.Bodies`."""

@@ -8,6 +8,7 @@ from synthetic import INSTRUCTION, PARAPHRASES, VIEWS, StillScene, synthetic_act
 from imfvla.config.horizon import Horizon
 from imfvla.data import FrameStore, Statistics, Windows
 from imfvla.errors import UserError
+from imfvla.rollouts.clock import Clock
 from imfvla.sources.mcap import McapSource
 from imfvla.tasks.bimanual_robot import bimanual_robot
 from imfvla.types import tokenize
@@ -56,7 +57,7 @@ def test_replaying_windows_gives_the_recorded_episode(dense, horizon):
     for seed in range(NUM_EPISODES):
         executed = []
         for step in range(NUM_STEPS):
-            if windows.horizon.is_decision(step):
+            if Clock(windows.horizon).is_decision(step):
                 (row,) = np.flatnonzero((episodes == seed) & (steps == step))
                 chunk = batch.actions[row][batch.valid[row]]
                 executed.extend(chunk[: windows.horizon.exec])

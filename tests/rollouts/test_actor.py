@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from imfvla.config.horizon import Horizon
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, run_episode
 from imfvla.rollouts.actor import FAR, ChunkActor
+from imfvla.rollouts.clock import Clock
 
 horizons = st.integers(1, 5).flatmap(
     lambda obs: st.integers(1, 9).flatmap(
@@ -38,7 +39,7 @@ def test_known_actions_pass_through_policy_and_actor(horizon: Horizon, num_steps
         list(horizon.observed_steps(step)) for step in decisions
     ]
     assert set(env.looked) >= {step for steps in policy.seen for step in steps}
-    assert len(env.looked) == len(set(env.looked)) == sum(map(horizon.is_observed, range(num_steps)))
+    assert len(env.looked) == len(set(env.looked)) == sum(map(Clock(horizon).is_observed, range(num_steps)))
     assert len(result.inference_ms) == len(decisions)
     assert set(policy.evaluations) == {2}
 

@@ -9,10 +9,13 @@ import pytest
 import yaml
 from fakes import FakeEnvironment, KnownPolicy, build_fakes
 
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.condition import ConditionOptions
+from imfvla.config.protocol import USUAL, EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
 from imfvla.reporting.rows import TIMING
+from imfvla.reporting.runs import evaluations, rows
+from imfvla.reporting.table_row import table_of
 from imfvla.rollouts import workbench
 from imfvla.rollouts.evaluation import best_median_worst, evaluate
 from imfvla.rollouts.rollout_log import PARTIAL
@@ -33,6 +36,7 @@ def run(tmp_path: Path) -> RunDirectory:
         "name": "fake",
         "task": {"name": "fake", "variant": "default"},
         "observation": {"views": ["front"], "image_size": [16, 16]},
+        "horizon": {"obs": 1, "pred": 8, "exec": 4},
     }
     (run.path / "config.yaml").write_text(yaml.safe_dump(config))
     return run
@@ -215,7 +219,7 @@ def test_an_evaluation_from_before_noise_had_a_scale_is_not_repeated(run):
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_weights_that_are_no_tensors_are_named_and_nothing_is_left_behind(run, workers):
-    with pytest.raises(UserError, match="lacks the key 'horizon'"):
+    with pytest.raises(UserError, match="lacks the key 'action_frame'"):
         roll(run, episodes=1, first_seed=0, workers=workers, build=load_policy_alone)
     assert not list(run.path.glob("rollouts/*"))
 
@@ -240,7 +244,7 @@ def test_two_evaluations_do_not_write_into_one_folder(run):
 
 def test_known_policies_are_reset_between_episodes(run):
     roll(run)
-    _, policy = workbench._bench(build_fakes, run.path, 20)
+    _, policy = workbench._bench(build_fakes, run.path, 20, "none", None)
     assert isinstance(policy, KnownPolicy)
     assert [steps[0] for steps in policy.seen[:11]] == [*range(0, 40, 4), 0]
 
@@ -344,4 +348,89 @@ def test_the_keys_that_differ_from_the_training_are_named(run):
     (run.path / "config.yaml").write_text(yaml.safe_dump(config | {"horizon": {"exec": 4}}))
     with pytest.raises(UserError, match=r"horizon\.exec was 16, is 4\. Restore config\.yaml"):
         roll(run)
+    assert not list(run.path.glob("rollouts/*"))
+
+
+def running(run: RunDirectory, **options) -> list[dict]:
+    """An evaluation on a running clock."""
+    return roll(run, clock="running", **options)
+
+
+def test_a_delay_is_part_of_protocol_name_and_row(run):
+    roll(run)
+    paused = untimed_lines(run.rollouts(NAME))
+    (summary,) = running(run, delay_ms=50, meanwhile="continue")
+    assert summary["name"] == f"{NAME}_delay50-continue"
+    protocol = summary["protocol"]
+    assert (protocol["clock"], protocol["delay_ms"], protocol["delay_steps"]) == ("running", 50, 3)
+    lines = untimed_lines(run.rollouts(summary["name"]))
+    assert running(run, delay_ms=50, meanwhile="continue", overwrite=True)[0]["protocol"] == protocol
+    assert untimed_lines(run.rollouts(summary["name"])) == lines
+    (none,) = running(run, delay_ms=0)
+    assert untimed_lines(run.rollouts(none["name"])) == paused == untimed_lines(run.rollouts(NAME))
+    text = table_of([found for found in evaluations(run) if not found.is_usual]).notes[0]
+    assert "NFE 1: delay 50 ms (3 steps), continue." in text
+    assert [found.folder.name for found in rows(run)] == [NAME]  # the usual one stands for the run
+
+
+def test_an_evaluation_from_before_the_clock_is_not_repeated(run):
+    (summary,) = roll(run)
+    path = run.rollouts(NAME) / "summary.json"
+    old = {key: summary["protocol"][key] for key in summary["protocol"] if key not in USUAL}
+    path.write_text(json.dumps(summary | {"protocol": old}))
+    assert roll(run) == [summary]
+
+
+def test_a_measured_delay_is_taken_once_and_alone(run, monkeypatch):
+    (summary,) = running(run, delay_ms="measured")
+    alone = summary["latency_alone"]
+    assert summary["name"] == f"{NAME}_delaymeasured-hold"
+    assert alone["median_ms"] > 0 <= alone["load"]
+    assert (alone["calls"], alone["nfe"], alone["device"]) == (200, 1, "cpu")
+    assert summary["inference_ms_mean"] > 0  # of the rollouts
+    monkeypatch.setattr(workbench, "measure_latency", lambda *_: pytest.fail("measured again"))
+    (kept,) = running(run, delay_ms="measured", meanwhile="continue", episodes=2)
+    assert kept["latency_alone"] == alone
+    late = {"median_ms": 30.0, "p95_ms": 31.0, "calls": 20, "at": "2026-11-28", "load": 0.5}
+    monkeypatch.setattr(workbench, "measure_latency", lambda *_: late)
+    (again,) = running(run, delay_ms="measured", overwrite=True)
+    assert again["protocol"]["delay_steps"] == 2
+    assert (
+        "takes 30.0 ms (p95 31.0) alone"
+        in table_of([found for found in evaluations(run) if found.folder.name == again["name"]]).notes[0]
+    )
+
+
+def test_a_damaged_latency_is_named(run):
+    (run.path / "latency.json").write_text('[{"median_ms": "fast"}]')
+    with pytest.raises(UserError, match=r"latency\.json.*median_ms must be a finite number"):
+        running(run, delay_ms="measured")
+
+
+def test_a_delay_that_is_too_long_is_refused_before_anything_runs(run):
+    with pytest.raises(
+        UserError, match=r"delay_ms=100 is 5 control steps at 50 Hz, .* at most 4 are possible"
+    ):
+        running(run, delay_ms=100, meanwhile="continue")
+    assert not (run.path / "rollouts").exists()
+
+
+def test_a_condition_is_part_of_protocol_name_and_row_and_leaves_the_starts(run):
+    (plain,) = roll(run)
+    before = untimed_lines(run.rollouts(NAME))
+    (summary,) = roll(run, condition=ConditionOptions("action_lag", 2))
+    assert summary["name"] == f"{NAME}_action_lag2"
+    assert (summary["protocol"]["condition"], summary["protocol"]["severity"]) == ("action_lag", 2)
+    found = {evaluation.folder.name: evaluation for evaluation in evaluations(run)}
+    assert found[summary["name"]].unusual == ("action_lag 2",)
+    digests = [[row["start_digest"] for row in found[name].episodes] for name in (NAME, summary["name"])]
+    assert digests[0] == digests[1]
+    assert roll(run, overwrite=True)[0]["protocol"] == plain["protocol"]
+    assert untimed_lines(run.rollouts(NAME)) == before
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_condition_that_the_environment_cannot_have_is_refused_before_anything_runs(run, workers):
+    with pytest.raises(UserError, match=r"condition=mass needs a MuJoCo simulation .* the environment fake"):
+        roll(run, condition=ConditionOptions("mass", 1), workers=workers)
     assert not list(run.path.glob("rollouts/*"))

@@ -1,0 +1,127 @@
+"""Success against delay, and against the severity of each condition."""
+
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from imfvla.config.condition import NONE, SEVERITIES
+from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, RUNNING
+from imfvla.figures.panels import say_nothing_yet
+from imfvla.figures.reward_latency import errors
+from imfvla.figures.style import CYCLE, MARKERS, WIDTH, new_figure, style
+from imfvla.reporting.results import Result
+
+Point = tuple[float, Result]
+COLUMNS = 4
+
+
+def success_by_delay(results: Sequence[Result]) -> Figure:
+    """A panel for each condition and for what the robot does meanwhile; the paused clock is at 0."""
+    found = [result for result in results if not result.is_missing]
+    conditions = list(dict.fromkeys(_change(result, "condition", NONE) for result in found)) or [NONE]
+    panels = [(condition, meanwhile) for condition in conditions for meanwhile in (HOLD, CONTINUE)]
+    methods = _methods(found)
+    with style():
+        figure = new_figure(WIDTH, 0.9 + 2.7 * len(conditions))
+        axes = figure.subplots(len(conditions), 2, sharex=True, sharey=True, squeeze=False).ravel()
+        for axis, (condition, meanwhile) in zip(axes, panels, strict=True):
+            world = "" if condition == NONE else f", {condition}"
+            axis.set_title(f"the robot {'holds' if meanwhile == HOLD else 'continues'} meanwhile{world}")
+            axis.set_xlabel("delay of a chunk [ms]")
+            lines = {
+                method: [
+                    (_delay(result), result)
+                    for result in found
+                    if result.row.label == method
+                    and _change(result, "condition", NONE) == condition
+                    and _change(result, "meanwhile", HOLD if _is_running(result) else meanwhile) == meanwhile
+                ]
+                for method in methods
+            }
+            _draw(axis, lines, methods)
+        _finish(figure, axes[::2])
+    return figure
+
+
+def success_by_severity(results: Sequence[Result]) -> Figure:
+    """A panel for each condition; the unchanged world is at 0."""
+    found = [result for result in results if not result.is_missing]
+    conditions = [
+        name for name in dict.fromkeys(_change(r, "condition", NONE) for r in found) if name != NONE
+    ]
+    methods = _methods(found)
+    rows = -(-max(len(conditions), 1) // COLUMNS)
+    with style():
+        figure = new_figure(WIDTH, 0.9 + 2.2 * rows)
+        axes = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
+        for axis in axes[max(len(conditions), 1) :]:
+            axis.set_axis_off()
+        for axis, condition in zip(axes, conditions or [NONE], strict=False):
+            axis.set_title(condition if conditions else "")
+            axis.set_xlabel("severity")
+            axis.set_xticks([0, *SEVERITIES])
+            lines = {
+                method: [
+                    (_change(result, "severity", 0), result)
+                    for result in found
+                    if result.row.label == method and _change(result, "condition", NONE) in (NONE, condition)
+                ]
+                for method in methods
+            }
+            _draw(axis, lines, methods)
+        _finish(figure, axes[: max(len(conditions), 1) : COLUMNS])
+    return figure
+
+
+def _draw(axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str]) -> None:
+    if not any(lines.values()):
+        say_nothing_yet(axes, "nothing measured yet")
+    for method, points in lines.items():
+        if points:
+            points = sorted(points, key=lambda point: point[0])
+            shares = [result.metric("success_share").scaled(100) for _, result in points]
+            number = methods.index(method)
+            axes.errorbar(
+                [x for x, _ in points],
+                [share.value for share in shares],
+                yerr=errors(shares),
+                label=method,
+                color=CYCLE[number % len(CYCLE)],
+                marker=MARKERS[number % len(MARKERS)],
+                markersize=4.5,
+                linewidth=1.2,
+                capsize=2,
+            )
+
+
+def _finish(figure: Figure, left: Sequence[Axes]) -> None:
+    for axes in left:
+        axes.set_ylabel("success-like [%]")
+        axes.set_ylim(-3, 103)
+    handles = {
+        text: handle
+        for axes in figure.axes
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=2)
+
+
+def _methods(results: Sequence[Result]) -> list[str]:
+    return list(dict.fromkeys(result.row.label for result in results))
+
+
+def _change(result: Result, key: str, usual: object) -> object:
+    return dict(result.row.changes).get(key, usual)
+
+
+def _is_running(result: Result) -> bool:
+    return _change(result, "clock", None) == RUNNING
+
+
+def _delay(result: Result) -> float:
+    asked = _change(result, "delay_ms", 0)
+    if asked != MEASURED:
+        return float(asked)
+    return max(found.evaluation.summary["latency_alone"]["median_ms"] for found in result.evaluated)

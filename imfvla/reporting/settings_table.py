@@ -1,0 +1,155 @@
+"""A table of settings: success in each, and what it loses against the unchanged world, start by start."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
+from imfvla.reporting.mapping import TableTitle
+from imfvla.reporting.measured import Measured
+from imfvla.reporting.pairs import Pairs, refusal
+from imfvla.reporting.results import Result
+from imfvla.reporting.settings import label, name_of
+from imfvla.reporting.significance import holm
+from imfvla.reporting.table import MISSING, REFUSED, Table, interval
+from imfvla.reporting.tables import Document
+
+UNCHANGED = "unchanged"
+ALPHA = 0.05
+METRICS = ("success_share", "avg_return", "chunk_jump", "inference_ms_mean")
+COLUMNS = (
+    "row", "setting", "nfe", "episodes", "success",
+    *(f"{name}{end}" for name in METRICS for end in ("", "_low", "_high")),
+    "delay_steps", "latency_alone_ms", "success_difference", "success_difference_low", "success_difference_high", "p",
+    "p_holm", "return_difference", "return_difference_low", "return_difference_high", "return_p", "status", "command",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """A row in a setting against the same row in the unchanged world."""
+
+    result: Result
+    usual: Result
+    success: Contrast | None = None
+    returns: Contrast | None = None
+    p_holm: float | None = None
+    refused: str | None = None
+
+
+def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Changed]:
+    """Every row of a table of settings, p-values of success corrected over all of them."""
+    named = {result.name: result for result in results}
+    found = []
+    for result in results:
+        if result.row.table == table.name:
+            changes = result.row.changes
+            base = next(name for name in table.rows if result.name == name_of(table.name, name, changes))
+            found.append(_compared(result, named[base]))
+    corrected = holm([one.success.p if one.success else None for one in found])
+    return [
+        Changed(one.result, one.usual, one.success, one.returns, p, one.refused)
+        for one, p in zip(found, corrected, strict=True)
+    ]
+
+
+def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
+    """Settings in lines and methods in columns for people; a line for each number for programs."""
+    found = against_unchanged(table, results)
+    usual = {one.usual.name: one.usual for one in found}
+    settings = list(dict.fromkeys(label(one.result.row.changes) for one in found))
+    cells = {(label(one.result.row.changes), one.usual.name): one for one in found}
+    rows = [(UNCHANGED, *(_usual_cell(result) for result in usual.values()))]
+    rows += [(text, *(_cell(cells.get((text, name))) for name in usual)) for text in settings]
+    measured = [one for one in found if one.success]
+    notes = [
+        "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
+        f"from the same starts. A star: p below {ALPHA} (exact McNemar, Holm over {len(measured)} comparisons). A "
+        "dash: the setting is in no line for this row.",
+        *(_sentence(usual[name], [one for one in measured if one.usual.name == name]) for name in usual),
+        *(f"{one.result.name}: refused, because {one.refused}." for one in found if one.refused),
+    ]
+    is_missing = any(one.result.is_missing or one.usual.is_missing for one in found)
+    commands = ((table.name, f"python -m imfvla.train -m +sweep={table.sweep}"),) if is_missing else ()
+    columns = ("World", *(f"{result.row.method} ({result.row.setting})" for result in usual.values()))
+    shown = Table(table.title, columns, tuple(rows), tuple(note for note in notes if note), (), commands)
+    data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
+    return Document(shown, Table(table.title, COLUMNS, tuple(data)))
+
+
+def _compared(result: Result, usual: Result) -> Changed:
+    if result.is_missing or usual.is_missing:
+        return Changed(result, usual)
+    reason = refusal(result.evaluated, usual.evaluated)
+    if reason:
+        return Changed(result, usual, refused=reason)
+    pairs = Pairs(result.evaluated, usual.evaluated)
+    return Changed(result, usual, success_difference(pairs), return_difference(pairs))
+
+
+def _usual_cell(result: Result) -> str:
+    return MISSING if result.is_missing else _count(result)
+
+
+def _cell(one: Changed | None) -> str:
+    if one is None:
+        return "-"
+    if one.result.is_missing or one.refused:
+        return REFUSED if one.refused else MISSING
+    if one.success is None:
+        return _count(one.result)
+    star = "*" if one.p_holm is not None and one.p_holm < ALPHA else ""
+    return f"{_count(one.result)} ({100 * one.success.result.value:+.0f}{star})"
+
+
+def _count(result: Result) -> str:
+    return f"{sum(row['success'] for row in result.episodes)}/{len(result.episodes)}"
+
+
+def _sentence(usual: Result, measured: Sequence[Changed]) -> str:
+    """What was found of one row, whichever way it goes; nothing where it was not measured."""
+    if not measured:
+        return ""
+    worst = min(measured, key=lambda one: one.success.result.value)
+    percent = worst.success.result.scaled(100)
+    lost = [
+        one
+        for one in measured
+        if one.p_holm is not None and one.p_holm < ALPHA and one.success.result.value < 0
+    ]
+    told = (
+        f"fewer successes than in the unchanged world in {len(lost)} of {len(measured)} settings"
+        if lost
+        else f"no setting of {len(measured)} in which fewer successes are told from chance"
+    )
+    return (
+        f"{usual.row.label}: {told}; the lowest is {label(worst.result.row.changes)} with {percent.value:+.0f} points "
+        f"{interval(percent, 0)}."
+    )
+
+
+def _data(one: Changed) -> tuple[str, ...]:
+    result, row = one.result, one.result.row
+    summaries = [found.evaluation.summary for found in result.evaluated]
+    alone = [summary["latency_alone"]["median_ms"] for summary in summaries if "latency_alone" in summary]
+    none = Contrast(Measured(None), None, "", None)
+    success, returns = one.success or none, one.returns or none
+    numbers = [measured for name in METRICS for measured in _of(result.metric(name))]
+    numbers += [
+        max((summary["protocol"]["delay_steps"] for summary in summaries), default=None),
+        max(alone, default=None),
+        *_of(success.result), success.p, one.p_holm, *_of(returns.result), returns.p,
+    ]  # fmt: skip
+    return (
+        one.usual.name,
+        label(row.changes) or UNCHANGED,
+        str(row.nfe),
+        str(len(result.episodes)),
+        "" if result.is_missing else str(sum(episode["success"] for episode in result.episodes)),
+        *("" if value is None else f"{value:.6g}" for value in numbers),
+        MISSING if result.is_missing else REFUSED if one.refused else "measured",
+        result.answer.command if result.is_missing else "",
+    )
+
+
+def _of(measured: Measured) -> tuple[float | None, ...]:
+    return measured.value, measured.low, measured.high

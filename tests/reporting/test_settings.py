@@ -1,0 +1,145 @@
+"""Tables of settings: what tables.yaml says, which evaluations answer, and what is compared with what."""
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from synthetic_runs import answer_row
+
+from imfvla.command.sweep import jobs_of_rows
+from imfvla.config.assets import folder
+from imfvla.errors import UserError
+from imfvla.figures.settings import success_by_delay, success_by_severity
+from imfvla.reporting.answers import Sources
+from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.results import Result
+from imfvla.reporting.settings import label, rows_of_settings
+from imfvla.reporting.settings_table import settings_table
+
+MAPPING = read_mapping()
+BY_NAME = {row.name: row for row in MAPPING.rows}
+BASES = ("transfer_imf_infer1", "transfer_l1")
+RUNNING = {"clock": "running", "delay_ms": 120, "delay_steps": 6, "meanwhile": "continue"}
+
+
+def rows(*entries: dict, table: str = "table4") -> list:
+    return rows_of_settings(list(entries), table, BASES, BY_NAME, Path("tables.yaml"))
+
+
+def test_an_entry_is_every_product_of_its_values_for_every_row():
+    found = rows(
+        {"clock": "running", "delay_ms": [20, 40], "meanwhile": ["hold", "continue"]},
+        {"condition": "bump", "severity": [1, 3], "rows": ["transfer_l1"]},
+    )
+    assert [row.name for row in found[:3]] == [
+        "table4: transfer_imf_infer1, delay 20 ms, hold",
+        "table4: transfer_l1, delay 20 ms, hold",
+        "table4: transfer_imf_infer1, delay 20 ms, continue",
+    ]
+    assert [row.name for row in found[8:]] == ["table4: transfer_l1, bump 1", "table4: transfer_l1, bump 3"]
+    assert dict(found[2].changes) == {"clock": "running", "delay_ms": 20, "meanwhile": "continue"}
+    assert found[2].options() == ["clock=running", "delay_ms=20", "meanwhile=continue"]
+    assert found[9].options("evaluation.") == ["condition=bump", "evaluation.condition.severity=3"]
+    assert label(found[9].changes) == "bump 3"
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"speed": 2}, r"table4, setting 1: unknown key 'speed'"),
+        ({"clock": "running", "delay_ms": -1}, r"setting 1\.delay_ms must be measured, or a number"),
+        ({"condition": "fog", "severity": 1}, r"condition\.name must be one of"),
+        ({"condition": "bump"}, r"condition\.severity must be 1, 2 or 3"),
+        ({"clock": "paused"}, r"must be another setting than that of the tables"),
+        ({"rows": ["socket_act"], "noise": "held"}, r"no row of the table 'socket_act'"),
+    ],
+)
+def test_wrong_settings_are_named(entry, message):
+    with pytest.raises(UserError, match=message):
+        rows(entry)
+
+
+def test_every_table_of_settings_is_filled_by_its_sweep():
+    for table in MAPPING.of_settings:
+        content = yaml.safe_load((folder("conf") / "sweep" / f"{table.sweep}.yaml").read_text())
+        assert content["tables"] == [table.name]
+    jobs = jobs_of_rows(MAPPING.of_table("table4"))
+    assert all("evaluation.clock=running" in job or "condition=bump" in job for job in jobs)
+    assert len(jobs) == len(set(jobs))
+
+
+@pytest.fixture
+def results(tmp_path) -> list[Result]:
+    """Both rows in the unchanged world; the first one with a delay too, and with a bump."""
+    for name, quality in zip(BASES, (0.8, 0.6), strict=True):
+        answer_row(tmp_path, BY_NAME[name], quality=quality)
+    answer_row(tmp_path, BY_NAME[BASES[0]], quality=0.3, **RUNNING)
+    answer_row(tmp_path, BY_NAME[BASES[0]], quality=0.8, condition="bump", severity=2)
+    found = rows(
+        {key: value for key, value in RUNNING.items() if key != "delay_steps"},
+        {"condition": "bump", "severity": 2},
+    )
+    sources = Sources([tmp_path])
+    return [Result.of(sources.answer(row, MAPPING)) for row in (*(BY_NAME[name] for name in BASES), *found)]
+
+
+TABLE = replace(MAPPING.table("table4"), rows=BASES)
+
+
+def test_only_an_evaluation_in_that_setting_answers(results):
+    assert [result.is_missing for result in results] == [False, False, False, True, False, True]
+    assert "clock=running delay_ms=120 meanwhile=continue" in results[3].answer.command
+    assert "condition=bump condition.severity=2" in results[5].answer.command
+    assert len({result.evaluated[0].evaluation.folder for result in results if not result.is_missing}) == 4
+
+
+def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
+    document = settings_table(TABLE, results)
+    unchanged, delayed, bumped = document.shown.rows
+    counts = [sum(row["success"] for row in result.episodes) for result in results]
+    assert unchanged == ("unchanged", f"{counts[0]}/100", f"{counts[1]}/100")
+    assert delayed == ("delay 120 ms, continue", f"{counts[2]}/100 ({counts[2] - counts[0]:+d}*)", "missing")
+    assert bumped == ("bump 2", f"{counts[4]}/100 (+0)", "missing")
+    assert "fewer successes than in the unchanged world in 1 of 2 settings" in " ".join(document.shown.notes)
+    assert document.shown.commands == (("table4", "python -m imfvla.train -m +sweep=clock"),)
+    lines = list(csv.DictReader(io.StringIO(document.data.csv())))
+    assert [(line["setting"], line["status"]) for line in lines] == [
+        ("unchanged", "measured"), ("unchanged", "measured"), ("delay 120 ms, continue", "measured"),
+        ("delay 120 ms, continue", "missing"), ("bump 2", "measured"), ("bump 2", "missing"),
+    ]  # fmt: skip
+    assert float(lines[2]["success_difference"]) == pytest.approx((counts[2] - counts[0]) / 100)
+    assert float(lines[2]["success_difference_low"]) < float(lines[2]["success_difference"])
+    assert float(lines[2]["p_holm"]) == pytest.approx(2 * float(lines[2]["p"]), rel=1e-3)
+    assert lines[2]["delay_steps"] == "6"
+
+
+def test_what_is_not_measured_yet_is_said(tmp_path):
+    sources = Sources([tmp_path])
+    missing = [
+        Result.of(sources.answer(row, MAPPING))
+        for row in (*(BY_NAME[name] for name in BASES), *rows({"noise": "held"}))
+    ]
+    document = settings_table(TABLE, missing)
+    assert {cell for row in document.shown.rows for cell in row[1:]} == {"missing"}
+    for draw in (success_by_delay, success_by_severity):
+        assert "nothing measured yet" in {
+            text.get_text() for axes in draw(missing).axes for text in axes.texts
+        }
+
+
+def test_figures_have_a_line_for_every_method(results):
+    delays = success_by_delay(results)
+    titles = [axes.get_title(loc="left") for axes in delays.axes]
+    assert titles == [
+        "the robot holds meanwhile", "the robot continues meanwhile", "the robot holds meanwhile, bump",
+        "the robot continues meanwhile, bump",
+    ]  # fmt: skip
+    assert [len(axes.containers) for axes in delays.axes] == [2, 2, 1, 1]
+    x = [line.get_xdata().tolist() for line in delays.axes[1].lines if len(line.get_xdata()) == 2]
+    assert [0.0, 120.0] in x
+    severities = success_by_severity(results)
+    assert severities.axes[0].get_title(loc="left") == "bump"
+    assert len(severities.axes[0].containers) == 2
