@@ -38,9 +38,10 @@ class TaskTitle:
 
 @dataclass(frozen=True, slots=True)
 class TableTitle:
-    """A table of rows of one task, of `rows` of others in other settings, or of comparisons, which are corrected together.
+    """A table of rows of one task, of `rows` of others in other settings, or of comparisons.
 
-    `printed` is its number in the paper, None where the paper has no such table; `figure` draws its rows.
+    Comparisons of one table are corrected together. `printed` is its number in the paper, None where the paper has no
+    such table; `figure` draws its rows.
     """
 
     name: str

@@ -16,10 +16,10 @@ DEFAULT = "default"
 def run_name(overrides: Sequence[str]) -> str:
     """Directory name that the overrides of a command determine: "default" without any.
 
-    Sorted `key=value` pairs joined by commas, without those that only name the run (exp, name) or say how it
-    executes or is evaluated; characters that shells or file systems dislike become "-". Options of a source that are long together are
-    a digest behind its name, as in "demos=ros2-1f3a97c2". What is long without the training seed ends with a digest,
-    and the seed follows.
+    Sorted `key=value` pairs joined by commas, without those that only name the run (exp, name) or say how it executes
+    or is evaluated; characters that shells or file systems dislike become "-". Options of a source that are long
+    together are a digest behind its name, as in "demos=ros2-1f3a97c2". What is long without the training seed ends with
+    a digest, and the seed follows.
     """
     parts = sorted({text.lstrip("+~") for text in overrides if not _is_execution_key(key_of(text))})
     parts = _with_short_source(parts)

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from synthetic_runs import answer_row
 
-from imfvla.command.sweep import jobs_of_rows
+from imfvla.command.planning import jobs_of_rows
 from imfvla.config.assets import folder
 from imfvla.errors import UserError
 from imfvla.figures.settings import success_by_delay, success_by_severity
