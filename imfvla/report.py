@@ -58,6 +58,8 @@ def main(config: dict[str, Any]) -> None:
     paths = publication.write()
     for table in publication.tables:
         table.print()
+    for sentence in publication.left_out:
+        print(sentence)
     for path in paths:
         print(path)
 

@@ -74,7 +74,7 @@ def test_all_files_are_there(runs, tmp_path, method):
     tables = {f"{stem}{suffix}" for stem in STEMS for suffix in (".md", ".csv", ".tex")}
     assert tables | {"index.html"} == {name for name in found if "/" not in name}
     figures = {name for name in found if name.startswith("figures/")}
-    assert len(figures) == 26
+    assert len(figures) == 18
     assert {
         f"figures/{name}.png" for name in ("figure1_overview", "figure4_ablations", "learning")
     } <= figures

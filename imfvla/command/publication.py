@@ -39,11 +39,11 @@ OF_TABLE = {  # by `figure` of a table: what draws its rows, and what that shows
     "ablations": (ablations, "ablations and rivals."),
     "success_by_delay": (
         success_by_delay,
-        "success against the delay of a chunk on a running clock. Bars are 95% intervals.",
+        "success against the delay of a chunk on a running clock.",
     ),
     "success_by_severity": (
         success_by_severity,
-        "success against the severity of each condition. Bars are 95% intervals.",
+        "success against the severity of each condition.",
     ),
     "success_by_cost": (success_by_cost, "success against the network calls and the time of a chunk."),
 }
@@ -58,6 +58,9 @@ class Publication:
     copies: dict[
         Path, tuple[Path, Path]
     ]  # of files of runs that the page shows: copy -> original, run directory
+    left_out: tuple[
+        str, ...
+    ] = ()  # a line for each table without any measured row; their files are written too
 
     def write(self) -> list[Path]:
         """All files or none, after the copies. Raises UserError on a write error."""
@@ -97,20 +100,23 @@ def publish(
             f"No run with a finished evaluation below {', '.join(map(str, directories))}: make one with "
             "python -m imfvla.train +exp=socket_ph32_exec16, or name directories=[...]."
         )
+    measured = [table for table in mapping.tables if _is_measured(table, mapping, results)]
+    left_out = [table for table in mapping.tables if table not in measured]
     documents = {table.name: _document(table, mapping, results) for table in mapping.tables}
     documents["others"] = other_table(others)
     if offline:
         documents["offline"] = offline_table(offline)
-    figures = _figures(mapping, results, others, method)
+    figures = _figures(mapping, measured, results, others, method)
     pictures = [Picture(name, caption, files[".svg"]) for name, (caption, files) in figures.items()]
-    tables = tuple(document.shown for document in documents.values())
+    hidden = {table.name for table in left_out}
+    tables = tuple(document.shown for name, document in documents.items() if name not in hidden)
     linked = Media(output, is_copied=media)
     files = {output / "index.html": page(tables, pictures, [*results, *others], linked).encode()}
     for stem, document in documents.items():
         files |= {output / f"{stem}{suffix}": text.encode() for suffix, text in _formats(document).items()}
     for name, (_, rendered) in figures.items():
         files |= {output / "figures" / f"{name}{suffix}": content for suffix, content in rendered.items()}
-    return Publication(tables, files, linked.copies)
+    return Publication(tables, files, linked.copies, tuple(map(_not_measured, left_out)))
 
 
 def _offline(directories: Sequence[Path]) -> list[tuple[str, dict[str, Any]]]:
@@ -127,6 +133,20 @@ def _formats(document: Document) -> dict[str, str]:
     return {".md": document.shown.markdown(), ".csv": document.data.csv(), ".tex": document.shown.latex()}
 
 
+def _is_measured(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> bool:
+    """Whether any row of the table has a run."""
+    found = {result.name: result for result in results if not result.is_missing}
+    if table.of == COMPARISONS:
+        compared = mapping.of_comparisons(table.name)
+        return any({one.row.name, one.baseline.name} <= found.keys() for one in compared)
+    return any(result.row.table == table.name for result in found.values())
+
+
+def _not_measured(table: TableTitle) -> str:
+    command = f": python -m imfvla.train -m +sweep={table.sweep}" if table.sweep else ""
+    return f"{table.title}: no row measured yet{command}"
+
+
 def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result]) -> Document:
     if table.of == COMPARISONS:
         return comparison_table(table.title, compare(mapping.of_comparisons(table.name), results))
@@ -137,9 +157,13 @@ def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result])
 
 
 def _figures(
-    mapping: RowMapping, results: Sequence[Result], others: Sequence[Result], method: Mapping[str, Any]
+    mapping: RowMapping,
+    measured: Sequence[TableTitle],
+    results: Sequence[Result],
+    others: Sequence[Result],
+    method: Mapping[str, Any],
 ) -> dict[str, tuple[str, dict[str, bytes]]]:
-    """Caption and files of each figure, by name."""
+    """Caption and files of each figure, by name; without those of tables that have no `measured` row."""
     settings = {
         table: [r for r in results if r.row.table == table.name or r.row.name in table.rows]
         for table in mapping.of_settings
@@ -156,18 +180,18 @@ def _figures(
             f"Figure 2. What the generator of {method['name']} learns, and what its sublayers read.",
         ),
     }
-    for table in mapping.of_rows:
-        if table.figure is not None:
-            draw, shows = OF_TABLE[table.figure]
-            number = len(drawn) + 1
-            title = mapping.task(table.task).title if table.printed else table.title
-            rows = [result for result in results if result.row.table == table.name]
-            caption = f"Figure {number}. {title[:1].upper()}{title[1:]}: {shows} Bars are 95% intervals."
-            drawn[f"figure{number}_{table.figure}"] = (draw(rows), caption)
-    for table, rows in settings.items():
-        if table.figure is not None:
-            draw, shows = OF_TABLE[table.figure]
-            drawn[table.figure] = (draw(rows), f"{table.title}: {shows}")
+    numbers = {table: number for number, table in enumerate(filter(lambda t: t.printed, mapping.of_rows), 3)}
+    for table in measured:
+        if table.figure is None:
+            continue
+        draw, shows = OF_TABLE[table.figure]
+        rows = settings.get(table) or [result for result in results if result.row.table == table.name]
+        if number := numbers.get(table):
+            title = mapping.task(table.task).title
+            name, title = f"figure{number}_{table.figure}", f"Figure {number}. {title[:1].upper()}{title[1:]}"
+        else:
+            name, title = f"{table.figure}_{table.name}", table.title
+        drawn[name] = (draw(rows), f"{title}: {shows} Bars are 95% intervals.")
     drawn |= {
         "evaluations": (
             success_by_evaluations(every),

@@ -51,7 +51,7 @@ class TableTitle:
     printed: Annotated[int, PRINTED] | None = None
     figure: Annotated[str, one_of(*FIGURES)] | None = None
     rows: tuple[str, ...] = ()
-    sweep: str | None = None  # of conf/sweep, which fills a table of settings
+    sweep: str | None = None  # of conf/sweep, which fills the table
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,10 +198,8 @@ def _check_tables(tables: Sequence[TableTitle], tasks: Sequence[TaskTitle], path
             named(table.task, known, f"{where}: unknown task")
             wanted = "the names of rows" if table.of == SETTINGS else "absent but with of: settings"
             require(bool(table.rows) == (table.of == SETTINGS), f"{where}.rows", wanted, list(table.rows))
-            wanted = (
-                "the name of a file in conf/sweep" if table.of == SETTINGS else "absent but with of: settings"
-            )
-            require(bool(table.sweep) == (table.of == SETTINGS), f"{where}.sweep", wanted, table.sweep)
+            if table.of == SETTINGS:
+                require(bool(table.sweep), f"{where}.sweep", "the name of a file in conf/sweep", table.sweep)
 
 
 def _row(entry: dict[str, Any], table: TableTitle, number: int, path: Path, default: Wanted) -> TableRow:
