@@ -13,7 +13,6 @@ disk                               a full file system, a read-only one (both mou
 space                              a small disk (mounted) that is full again and again while it grows, for every kind of
                                    work
 workers                            worker processes that die and hang in the middle of an evaluation
-frozen                             an evaluation and its worker that are stopped for a minute
 changes                            data, rows, numbers, config, weights and code that change silently
 leftovers                          SIGKILL within the writing of a state, always; what is left is counted
 strangers                          a link that leads out, a pipe, a socket, a device, a directory or 8 GB of zeros in
@@ -61,7 +60,7 @@ from faults.strangers import strangers  # noqa: E402
 from faults.sweep import sweep  # noqa: E402
 from faults.torchrun import torchrun  # noqa: E402
 from faults.work import collect, roll_out, train  # noqa: E402
-from faults.workers import frozen, workers  # noqa: E402
+from faults.workers import workers  # noqa: E402
 
 FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "training": kills_of(partial(train, steps=150), state_of, 150),
@@ -73,7 +72,6 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "disk": disk,
     "space": space,
     "workers": workers,
-    "frozen": frozen,
     "changes": changes,
     "leftovers": leftovers,
     "strangers": strangers,

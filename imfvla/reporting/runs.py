@@ -13,6 +13,7 @@ from imfvla.reporting.mapping import TableRow, read_mapping
 from imfvla.reporting.recomputed import recomputed
 from imfvla.reporting.records import Row, Summary
 from imfvla.storage.documents import read_json
+from imfvla.storage.opening import walk
 from imfvla.storage.records import as_record
 from imfvla.storage.run_directory import RunDirectory, training_steps
 from imfvla.storage.run_names import run_key
@@ -146,7 +147,7 @@ def find_runs(directories: Iterable[Path]) -> list[RunDirectory]:
     for root in directories:
         # `Path.glob` fails where a training deletes a folder meanwhile.
         found |= dict.fromkeys(
-            sorted(Path(place) for place, _, names in os.walk(root) if "config.yaml" in names)
+            sorted(Path(place) for place, _, names in walk(root) if "config.yaml" in names)
         )
     return [RunDirectory(path) for path in found]
 

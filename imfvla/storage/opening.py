@@ -8,6 +8,7 @@ and is not recognised. Nobody else may change the directory meanwhile.
 import math
 import os
 import stat
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -103,11 +104,19 @@ def real_path(path: Path, home: Path | None = None) -> Path:
 
 def refuse_strangers(home: Path) -> None:
     """Raises UserError where something in `home` would redirect or block writes: see this module."""
-    for place, folders, files in os.walk(home):
+    for place, folders, files in walk(home):
         for path in (Path(place, name) for name in (*folders, *files)):
             real_path(path, home)
             if not os.path.isdir(path) and os.path.exists(path):
                 _refuse_special(path, os.stat(path).st_mode)
+
+
+def walk(home: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """`os.walk`. Raises UserError where folders are nested too deeply for it."""
+    try:
+        yield from os.walk(home)
+    except RecursionError:
+        raise UserError(f"{home} has folders that are nested hundreds of levels deep: remove them.") from None
 
 
 def _open(path: Path, flags: int, home: Path | None) -> int:

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from imfvla.errors import UserError
+from imfvla.process import running_time
 from imfvla.process.workers import worker_pool
 
 
@@ -133,3 +134,16 @@ def test_workers_end_with_the_process_that_started_them(tmp_path):
     assert done.returncode == -signal.SIGKILL
     with suppress(psutil.NoSuchProcess):
         psutil.Process(int(done.stdout)).wait(timeout=60)
+
+
+def test_a_worker_is_not_late_because_its_parent_was_stopped(monkeypatch):
+    """Ctrl-Z for a quarter of an hour, a second after a call was sent."""
+    stopped_s, clock = 900.0, time.monotonic
+    with worker_pool(1, timeout_s=300.0) as run_all:
+        assert list(run_all(abs, [(-1,)])) == [1]
+        began = clock()
+        monkeypatch.setattr(
+            running_time.time, "monotonic", lambda: clock() + (stopped_s if clock() > began + 1.0 else 0.0)
+        )
+        assert list(run_all(time.sleep, [(3.0,)])) == [None]
+        assert run_all.incidents == 0

@@ -249,3 +249,13 @@ def test_kinds_are_told_by_the_end_of_a_name():
     assert kind_of(Path("a.yaml")) is YAML
     with pytest.raises(UserError, match=r"x\.pem must end in one of"):
         kind_of(Path("x.pem"))
+
+
+def test_folders_nested_too_deeply_are_an_error(tmp_path, monkeypatch):
+    def too_deep(_):
+        yield str(tmp_path), [], []
+        raise RecursionError
+
+    monkeypatch.setattr(os, "walk", too_deep)  # as up to Python 3.11 beyond some 500 levels
+    with pytest.raises(UserError, match="nested hundreds of levels deep"):
+        refuse_strangers(tmp_path)
