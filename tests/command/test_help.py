@@ -1,6 +1,6 @@
 import pytest
 
-from imfvla import evaluate, train
+from imfvla import report, train
 
 
 def printed(command, *arguments, capsys):
@@ -19,7 +19,7 @@ def test_help_says_what_the_command_does_and_lists_groups_and_keys(capsys):
 
 
 def test_help_shows_no_group_where_the_config_has_none(capsys):
-    text = printed(evaluate, capsys=capsys)
+    text = printed(report, capsys=capsys)
     assert "Groups" not in text
     assert "+exp:" not in text
     assert "\nrun: null\n" in text

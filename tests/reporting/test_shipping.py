@@ -100,7 +100,7 @@ def test_the_command_is_the_recorded_one_where_there_is_one(tmp_path):
 
 
 def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
-    run = make_run(tmp_path / "run", size=8_000_001)
+    run = make_run(tmp_path / "run", size=16_000_001)
     write_json(run.path / "depth_attention.json", {})
     ship(run, tmp_path / "results", with_weights=False)
     assert (tmp_path / "results" / "depth_attention.json").is_file()
@@ -114,7 +114,7 @@ def test_results_alone_leave_the_weights_behind_however_large(tmp_path):
         ({"state": RUNNING}, "not a finished run"),
         ({"first_seed": 10_000}, "no evaluation of the reporting band"),
         ({"first_seed": 1_000_000}, "no evaluation of the reporting band"),
-        ({"size": 8_000_001}, "wanted at most 8000000"),
+        ({"size": 16_000_001}, "wanted at most 16000000"),
     ],
 )
 def test_what_may_not_be_shipped_is_refused_and_nothing_is_written(tmp_path, changes, reason):
