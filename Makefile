@@ -11,6 +11,7 @@ EXP ?= socket_ph32_exec16
 TASK ?= socket
 EPISODES ?= 4
 ARGS ?=
+HASHES ?=
 
 SHIPPED_dwell := transfer_dwell/seed=0
 SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/generator=imf_plain)
@@ -25,7 +26,7 @@ INSTALLED := $(VENV)/.installed
 help:  ## List the targets
 	@awk 'BEGIN {FS = ":.*## "; print "make <target> [NAME=value ...]\n"} \
 	     /^[a-z-]+:.*## / {printf "  %-21s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
-	@printf '\n  ARGS="..." is passed to the command; PYTHON=python3.12 sets the interpreter of $(VENV).\n'
+	@printf '\n  ARGS="..." is passed to the command; PYTHON=python3.12 sets the interpreter of $(VENV), HASHES=1 checks what is installed.\n'
 
 setup: $(INSTALLED)  ## Install into .venv, install a GL library if none renders, check the machine
 	@$(PY) tools/doctor.py --only gl > /dev/null || { [ $$? != 2 ] && tools/install_gl.sh $(PY); }
@@ -86,15 +87,14 @@ clean:  ## Remove .venv and caches; runs/ and data/ stay
 	rm -rf $(VENV) .pytest_cache .ruff_cache *.egg-info build dist
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Only files whose hash is known: setuptools first, since one package and labmaze's replacement are built. PyPI's torch
-# asks for CUDA packages, its CPU wheel for none. The last line installs this project and needs no other file.
-$(INSTALLED): pyproject.toml setup.py constraints.txt hashes.txt hashes-cuda.txt
+$(INSTALLED): pyproject.toml setup.py constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "imfvla needs Python 3.11 or newer, found $$($(PYTHON) --version 2>&1); name one: make setup PYTHON=python3.11" >&2; \
 	  exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { \
 	  echo "$(PYTHON) could not create a virtual environment; on Debian: sudo apt-get install python3-venv" >&2; \
 	  exit 1; }
+ifdef HASHES  # only files that hashes.txt knows; setuptools first, since some packages are built
 	@sed -n '/^setuptools==/,/[^\\]$$/p' hashes.txt > $(VENV)/setuptools.txt
 	@$(PIP) install --require-hashes -r $(VENV)/setuptools.txt
 	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(BUILD) ./tools/labmaze; fi
@@ -102,4 +102,8 @@ $(INSTALLED): pyproject.toml setup.py constraints.txt hashes.txt hashes-cuda.txt
 	@if $(PY) -c 'from importlib.metadata import requires; exit("cuda" not in str(requires("torch")))'; then \
 	  $(BUILD) --require-hashes -r hashes-cuda.txt; fi
 	$(BUILD) -e .
+else
+	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(PIP) install ./tools/labmaze; fi
+	$(PIP) install -c constraints.txt -e '.[dev]'
+endif
 	@touch $@

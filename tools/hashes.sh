@@ -13,7 +13,7 @@ compile() {
 
 # labmaze has no wheel for Python 3.13: see tools/labmaze.
 {
-  echo "# SHA-256 of every file that PyPI has of the packages of constraints.txt: make setup installs no other file."
+  echo "# SHA-256 of every file that PyPI has of the packages of constraints.txt: make setup HASHES=1 installs no other file."
   echo "# Written by tools/hashes.sh, which is to be run after a change of constraints.txt."
   echo "# torch has one more, of its CPU wheel for CPython 3.11. A torch that is installed already is left as it is."
   compile --universal --no-deps constraints.txt |
