@@ -156,17 +156,26 @@ class RunDirectory:
     def claim(self, config: Mapping[str, Any], *, ignored: tuple[str, ...] = ()) -> None:
         """Claims the directory for this config: writes config.yaml, or compares with the existing one.
 
-        `ignored` keys may differ (they say how a run executes). Raises UserError naming other keys that differ.
+        `ignored` keys may differ (they say how a run executes). Where nothing was trained yet, as after a command that
+        found mistakes in its data, another config takes the place of the old one. Raises UserError naming other keys
+        that differ.
         """
-        if not (self.path / "config.yaml").exists():
-            write_text(self.path / "config.yaml", yaml.safe_dump(plain(config), sort_keys=False))
-            return
-        differing = differences(self.config(), plain(config), ignored)
-        if differing:
+        path = self.path / "config.yaml"
+        differing = differences(self.config(), plain(config), ignored) if path.exists() else []
+        if differing and self._has_results:
             raise UserError(
                 f"{self.path} holds a run with another config: {'; '.join(differing)}. Choose another "
                 "name=..., or delete that directory if it is not needed."
             )
+        if differing:
+            (self.path / OVERRIDES).unlink(missing_ok=True)
+        if differing or not path.exists():
+            write_text(path, yaml.safe_dump(plain(config), sort_keys=False))
+
+    @property
+    def _has_results(self) -> bool:
+        """Whether anything was trained or evaluated here."""
+        return any(path.exists() for path in (self.metrics, self.checkpoints, self.path / "rollouts"))
 
     def keep_overrides(self, overrides: Sequence[str]) -> None:
         """Records the overrides of the command that began the run, unless there are none or some are kept already."""

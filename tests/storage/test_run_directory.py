@@ -20,6 +20,7 @@ def test_config_comes_back_plain(tmp_path):
 def test_other_config_is_refused_by_key(tmp_path):
     run = RunDirectory(tmp_path)
     run.claim(CONFIG, ignored=("training.threads",))
+    run.metrics.write_text("")
     before = (tmp_path / "config.yaml").read_text()
     other = {
         **CONFIG,
@@ -32,6 +33,18 @@ def test_other_config_is_refused_by_key(tmp_path):
     ):
         run.claim(other, ignored=("training.threads",))
     assert (tmp_path / "config.yaml").read_text() == before
+
+
+def test_another_config_takes_its_place_where_nothing_was_trained(tmp_path):
+    run = RunDirectory(tmp_path)
+    run.claim(CONFIG)
+    run.keep_overrides(["seed=1"])
+    run.claim({**CONFIG, "name": "b"})
+    assert run.config()["name"] == "b"
+    assert run.overrides() is None
+    run.keep_overrides(["seed=2"])
+    run.claim({**CONFIG, "name": "b"})
+    assert run.overrides() == ["seed=2"]
 
 
 def test_ignored_keys_may_differ():
