@@ -174,22 +174,22 @@ def test_a_new_task_has_its_table_and_panels_from_the_mapping_alone(world, tmp_p
         "{ name: known, method: Known, setting: infer1, experiment: %s, nfe: 1, evaluation: { episodes: 4 } }"
     )
     text = PATH.read_text().replace("\ntasks:\n", f"\ntasks:\n  {world.name}: {{ title: a new task }}\n")
-    table = f"  table4: {{ title: Known policies, task: {world.name} }}"
+    table = f"  of_known: {{ title: Known policies, task: {world.name} }}"
     path.write_text(
-        text.replace("\ntables:\n", f"\ntables:\n{table}\n") + f"table4:\n  - {row % world.name}\n"
+        text.replace("\ntables:\n", f"\ntables:\n{table}\n") + f"of_known:\n  - {row % world.name}\n"
     )
     mapping = read_mapping(path)
     sources = Sources([tmp_path / "runs"])
-    (answer,) = (sources.answer(of_table, mapping) for of_table in mapping.of_table("table4"))
-    check_equal_protocols([answer], mapping.table("table4").task)
+    (answer,) = (sources.answer(of_table, mapping) for of_table in mapping.of_table("of_known"))
+    check_equal_protocols([answer], mapping.table("of_known").task)
     result = Result.of(answer)
-    shown = row_table(mapping.table("table4").title, [result]).shown
+    shown = row_table(mapping.table("of_known").title, [result]).shown
     assert shown.title == "Known policies"
     assert shown.rows[0][:3] == ("Known (infer1)", "1", "ours")
     assert shown.rows[0][7].startswith("1/4" if world.stages else "2/4")
     assert list(tasks_of([result])) == ["socket", "transfer", world.name]
     assert stages_of(world.name, [result]) == world.stages
-    with pytest.raises(UserError, match=f"table4 is of the task socket, but .* played {world.name}"):
+    with pytest.raises(UserError, match=f"of_known is of the task socket, but .* played {world.name}"):
         check_equal_protocols([answer], "socket")
 
 

@@ -138,6 +138,7 @@ def test_the_list_runs_nothing(monkeypatch, capsys, tmp_path):
 def test_the_readme_of_the_experiments_names_the_command_of_every_row():
     text = (PATH.parents[1] / "experiments" / "README.md").read_text()
     usual = re.compile(r" evaluation\.(first_seed|episodes|noise_seed|device)=\S+")
-    for job in jobs_of_rows(read_mapping().rows):
+    rows = [row for row in read_mapping().rows if not row.changes]  # the others are evaluations of these
+    for job in jobs_of_rows(rows):
         assert f"`python -m imfvla.train {usual.sub('', ' '.join(job))}`" in text
-    assert all(f"`{row.name}`" in text for row in read_mapping().rows)
+    assert all(f"`{row.name}`" in text for row in rows)
