@@ -82,6 +82,17 @@ def test_all_files_are_there(runs, tmp_path, method):
     assert found["figures/failures.png"].startswith(b"\x89PNG")
 
 
+def test_tables_without_a_measured_row_are_named_and_not_shown(runs, tmp_path, method, unrendered):
+    published = publish([runs], tmp_path / "out", MAPPING, method)
+    assert (
+        "Table 4: object transfer while the clock runs: no row measured yet; fill it with python -m imfvla.train -m "
+        "+sweep=clock"
+    ) in published.left_out
+    assert [table.title for table in published.tables if table.title.startswith("Table")] == [
+        MAPPING.table(f"table{number}").title for number in (1, 2, 3)
+    ]
+
+
 def test_equal_runs_give_equal_files(runs, tmp_path, method, unrendered):
     one, other = (publish([runs], tmp_path / "out", MAPPING, method).files for _ in range(2))
     assert one == other

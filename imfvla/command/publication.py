@@ -143,7 +143,7 @@ def _is_measured(table: TableTitle, mapping: RowMapping, results: Sequence[Resul
 
 
 def _not_measured(table: TableTitle) -> str:
-    command = f": python -m imfvla.train -m +sweep={table.sweep}" if table.sweep else ""
+    command = f"; fill it with python -m imfvla.train -m +sweep={table.sweep}" if table.sweep else ""
     return f"{table.title}: no row measured yet{command}"
 
 
