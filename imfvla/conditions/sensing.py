@@ -28,7 +28,7 @@ class Light(Change):
 
 
 class PixelNoise(Change):
-    """Every number of every picture is off by a normal error, drawn anew in each step."""
+    """Every number of every picture is off by a normal error, drawn in each step."""
 
     LEVELS = (8, 20, 40)  # deviation, of 255
 
@@ -117,12 +117,12 @@ class ActionLag(Change):
 
 
 class Distractors(Change):
-    """Things lie on the table that have nothing to do with the task. They are seen, and nothing can touch them."""
+    """Objects that the task does not need lie on the table. They are seen, and nothing can touch them."""
 
     LEVELS = (2, 4, 7)
 
     def lacking(self, env: Environment) -> str | None:
-        return None if hasattr(env, "distract") else "a table to put things on (`distract`)"
+        return None if hasattr(env, "distract") else "a table to put objects on (`distract`)"
 
     def begin(self, env: Environment, rng: np.random.Generator) -> None:
         env.distract(self.level, rng)
