@@ -131,13 +131,13 @@ def measure(composed: Mapping[str, Any], config: Mapping[str, Any], scratch: Pat
     # Imported late: it takes seconds, and mistakes in the config are reported first.
     import torch
 
-    from imfvla.benchmarks.clock import threads
     from imfvla.benchmarks.latency import measure_latency
     from imfvla.benchmarks.simulation import measure_demonstrations, measure_simulation
     from imfvla.benchmarks.training import measure_training
     from imfvla.command.rehearsal import build_unfitted
     from imfvla.environments import environment_of
     from imfvla.policy import build_policy
+    from imfvla.rollouts.threads import threads
     from imfvla.sources.mcap import McapSource
     from imfvla.training.data import prepare_windows
 

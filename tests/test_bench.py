@@ -8,7 +8,7 @@ import torch
 from fakes import FakeEnvironment
 
 from imfvla.bench import main
-from imfvla.benchmarks.clock import rate, threads, times_ms
+from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.benchmarks.latency import measure_latency
 from imfvla.benchmarks.sizes import measure_size
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP as PARTS
@@ -16,6 +16,7 @@ from imfvla.benchmarks.tables import latency_table, speed_ratios
 from imfvla.command.composition import compose
 from imfvla.command.rehearsal import build_unfitted
 from imfvla.reporting.mapping import read_mapping
+from imfvla.rollouts.threads import threads
 
 TOY = (
     "observation.image_size=[32,32]", "core.width=16", "core.depth=1", "core.heads=2", "training.batch_size=2",

@@ -1,11 +1,9 @@
 """How times are taken: after a warm-up, many times, as median and 95th percentile."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 
 
 def times_ms(functions: Sequence[Callable[[], object]], calls: int, warm_up: int = 3) -> np.ndarray:
@@ -27,14 +25,3 @@ def rate(function: Callable[[], object], seconds: float) -> float:
         function()
         calls += 1
     return calls / elapsed
-
-
-@contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Torch computes with `count` threads inside this context."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

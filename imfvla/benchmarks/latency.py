@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from imfvla.benchmarks.clock import threads, times_ms
+from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.sizes import core_inputs
-from imfvla.data.resample import resample
 from imfvla.environment import Environment
 from imfvla.policy import Policy
 from imfvla.reporting.bootstrap import bootstrap
-from imfvla.rollouts.actor import ChunkActor
-from imfvla.types import Observation, tokenize
+from imfvla.rollouts.actor import ChunkActor, observation_of
+from imfvla.rollouts.threads import threads
+from imfvla.types import tokenize
 
 FEWEST_CALLS = 50  # of a sampler with many steps
 
@@ -33,12 +33,7 @@ def measure_latency(
     seen = env.look()
     pictures = [seen[view] for view in policy.views]
     images, states = [pictures] * obs, [env.state()] * obs
-    fitted = np.stack([resample(picture, policy.image_size) for picture in pictures])
-    observation = Observation(
-        images=torch.from_numpy(np.stack([fitted] * obs)).permute(0, 1, 4, 2, 3).unsqueeze(0),
-        state=torch.from_numpy(np.stack(states)).unsqueeze(0),
-        instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
-    )
+    observation = observation_of(images, states, tokenize(env.instruction), policy.image_size)
     noise = torch.randn(1, *policy.noise_shape)
     measured = {}
     with threads(num_threads), torch.inference_mode():

@@ -58,9 +58,8 @@ class Publication:
     copies: dict[
         Path, tuple[Path, Path]
     ]  # of files of runs that the page shows: copy -> original, run directory
-    left_out: tuple[
-        str, ...
-    ] = ()  # a line for each table without any measured row; their files are written too
+    # a line for each table without any measured row; their files are written too
+    left_out: tuple[str, ...] = ()
 
     def write(self) -> list[Path]:
         """All files or none, after the copies. Raises UserError on a write error."""

@@ -6,7 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from imfvla.deployment.graphs import example_of, policy_graphs
+from imfvla.command.rehearsal import blank_observation
+from imfvla.deployment.graphs import policy_graphs
 from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.deployment.parity import TOLERANCE, largest_difference, latencies, observations
 from imfvla.policy import Policy
@@ -87,7 +88,7 @@ def export_policy(
 
 def _interface(policy: Policy) -> dict[str, Any]:
     """What a caller must know of inputs and outputs."""
-    example = example_of(policy)
+    example = blank_observation(policy)
     shapes = {
         "images": list(example.images.shape),
         "state": list(example.state.shape),

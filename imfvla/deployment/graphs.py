@@ -16,11 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.command.rehearsal import blank_observation
 from imfvla.config.assets import install_command
 from imfvla.errors import UserError
 from imfvla.nn.transformer import Conditioning
 from imfvla.policy import Policy
-from imfvla.types import MAX_WORDS, Observation
+from imfvla.types import Observation
 
 MAX_STEPS = 10  # written out in one graph
 OBSERVED = ("images", "state", "instruction")
@@ -41,7 +42,7 @@ class _Part(nn.Module):
 
 def policy_graphs(policy: Policy, nfe: int) -> dict[str, bytes]:
     """The ONNX models by name: "chunk" alone, or "observe" and a call of the core each. Raises UserError."""
-    example = example_of(policy)
+    example = blank_observation(policy)
     inputs, noise = (example.images, example.state, example.instruction), torch.randn(1, *policy.noise_shape)
     if nfe <= MAX_STEPS:
 
@@ -76,16 +77,6 @@ def _call(core: Callable[..., Tensor], num_times: int) -> Callable[..., Tensor]:
         return core(z, *rest[:num_times], Conditioning.of(rest[num_times:]))
 
     return call
-
-
-def example_of(policy: Policy) -> Observation:
-    """Some observation of the policy's shapes: (1, To, V, 3, H, W), (1, To, S) and (1, L)."""
-    steps = policy.horizon.obs
-    return Observation(
-        images=torch.zeros(1, steps, len(policy.views), 3, *policy.image_size, dtype=torch.uint8),
-        state=torch.zeros(1, steps, len(policy.robot.state)),
-        instruction=torch.ones(1, MAX_WORDS, dtype=torch.int64),
-    )
 
 
 def to_onnx(

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.benchmarks.clock import threads, times_ms
+from imfvla.benchmarks.clock import times_ms
 from imfvla.config.protocol import SELECTION_FIRST_SEED
-from imfvla.data.resample import resample
 from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.environments import environment_of
 from imfvla.errors import UserError
@@ -17,6 +16,8 @@ from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
 from imfvla.robot_of import has_environment
+from imfvla.rollouts.actor import observation_of
+from imfvla.rollouts.threads import threads
 from imfvla.sources.opening import open_source
 from imfvla.training.data import held_out_windows, prepare_windows
 from imfvla.types import Observation, tokenize
@@ -30,13 +31,12 @@ def observations(config: Mapping[str, Any], policy: Policy, count: int) -> Itera
         with closing(environment_of(config)) as env:
             for seed in range(SELECTION_FIRST_SEED, SELECTION_FIRST_SEED + count):
                 env.reset(seed)
-                seen = env.look()
-                pictures = [resample(seen[view], policy.image_size) for view in policy.views]
-                steps = policy.horizon.obs
-                yield Observation(
-                    images=torch.from_numpy(np.stack([pictures] * steps)).permute(0, 1, 4, 2, 3).unsqueeze(0),
-                    state=torch.from_numpy(np.stack([env.state()] * steps)).unsqueeze(0),
-                    instruction=torch.from_numpy(tokenize(env.instruction)).unsqueeze(0),
+                seen, steps = env.look(), policy.horizon.obs
+                yield observation_of(
+                    [[seen[view] for view in policy.views]] * steps,
+                    [env.state()] * steps,
+                    tokenize(env.instruction),
+                    policy.image_size,
                 )
     else:
         unseen = held_out_windows(prepare_windows(config, open_source(config)))

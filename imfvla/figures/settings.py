@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 
 from imfvla.config.condition import NONE, SEVERITIES
 from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, RUNNING
-from imfvla.figures.panels import say_nothing_yet
+from imfvla.figures.panels import look, say_nothing_yet
 from imfvla.figures.reward_latency import errors
-from imfvla.figures.style import CYCLE, MARKERS, WIDTH, new_figure, style
+from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.results import Result
 
 Point = tuple[float, Result]
@@ -81,14 +81,12 @@ def _draw(axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str]) -> 
         if points:
             points = sorted(points, key=lambda point: point[0])
             shares = [result.metric("success_share").scaled(100) for _, result in points]
-            number = methods.index(method)
             axes.errorbar(
                 [x for x, _ in points],
                 [share.value for share in shares],
                 yerr=errors(shares),
                 label=method,
-                color=CYCLE[number % len(CYCLE)],
-                marker=MARKERS[number % len(MARKERS)],
+                **look(methods.index(method)),
                 markersize=4.5,
                 linewidth=1.2,
                 capsize=2,

@@ -1,7 +1,7 @@
 """A table of settings: success in each, and what it loses against the unchanged world, start by start."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
 from imfvla.reporting.mapping import TableTitle
@@ -46,10 +46,7 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
             base = next(name for name in table.rows if result.name == name_of(table.name, name, changes))
             found.append(_compared(result, named[base]))
     corrected = holm([one.success.p if one.success else None for one in found])
-    return [
-        Changed(one.result, one.usual, one.success, one.returns, p, one.refused)
-        for one, p in zip(found, corrected, strict=True)
-    ]
+    return [replace(one, p_holm=p) for one, p in zip(found, corrected, strict=True)]
 
 
 def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:

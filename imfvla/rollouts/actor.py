@@ -78,7 +78,7 @@ class ChunkActor:
         )
         self._minimum = np.array(env.robot.action_min, np.float32)
         self._maximum = np.array(env.robot.action_max, np.float32)
-        self._instruction = torch.from_numpy(tokenize(env.instruction)).unsqueeze(0).to(self._device)
+        self._words = tokenize(env.instruction)
         self._noise.reset(seed)
         self._last: tuple[int, np.ndarray] | None = None  # decision and chunk before this one
         self._images: dict[int, list[np.ndarray]] = {}
@@ -159,14 +159,7 @@ class ChunkActor:
         Returns the chunk, float32 (Tp, A), and the time from these arrays to that one [ms].
         """
         began = time.perf_counter()
-        size = self._policy.image_size
-        fitted = np.stack([[resample(picture, size) for picture in step] for step in images])
-        pixels = torch.from_numpy(fitted).permute(0, 1, 4, 2, 3).unsqueeze(0)
-        observation = Observation(
-            images=pixels.to(self._device),
-            state=torch.from_numpy(np.stack(states)).unsqueeze(0).to(self._device),
-            instruction=self._instruction,
-        )
+        observation = observation_of(images, states, self._words, self._policy.image_size).to(self._device)
         noise = self._noise.draw(replanning, advance)
         chunks = self._policy.predict(observation, noise.to(self._device), self._nfe)
         answers = chunks.float().cpu().numpy()  # waits for an accelerator
@@ -182,3 +175,21 @@ class ChunkActor:
         margin = FAR * (self._maximum - self._minimum)
         if (actions < self._minimum - margin).any() or (actions > self._maximum + margin).any():
             raise ActionError(FAR_OUT_OF_RANGE)
+
+
+def observation_of(
+    images: Sequence[Sequence[np.ndarray]],
+    states: Sequence[np.ndarray],
+    words: np.ndarray,
+    size: tuple[int, int],
+) -> Observation:
+    """What a policy sees, of batch 1, from the V pictures and the state of each of To steps and word ids int64 (L,).
+
+    Pictures are uint8 (H, W, 3) of any size, and are brought to `size` (H, W).
+    """
+    fitted = np.stack([[resample(picture, size) for picture in step] for step in images])
+    return Observation(
+        images=torch.from_numpy(fitted).permute(0, 1, 4, 2, 3).unsqueeze(0),
+        state=torch.from_numpy(np.stack(states)).unsqueeze(0),
+        instruction=torch.from_numpy(words).unsqueeze(0),
+    )

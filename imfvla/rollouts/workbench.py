@@ -1,13 +1,11 @@
 """What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from imfvla.conditions import changed
 from imfvla.config.condition import NONE
@@ -20,6 +18,7 @@ from imfvla.reporting.rows import row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.latency import measure_latency
+from imfvla.rollouts.threads import threads
 from imfvla.storage.run_directory import RunDirectory
 
 VIDEO_HEIGHT = 240  # of a view [px]
@@ -70,7 +69,7 @@ def describe_world(job: Job) -> World:
 def measure_alone(job: Job) -> Latency:
     """The time of a chunk of the job's policy, see `rollouts.latency`."""
     env, policy = _place(job)
-    with one_thread():
+    with threads(1):
         actor = actor_of(job.protocol, policy)
         return measure_latency(env, actor, policy.horizon.obs, policy.views, job.protocol.nfe)
 
@@ -109,7 +108,7 @@ def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
         "checkpoint_step": job.step,
         **({"unusual": said} if (said := ", ".join(unusual(asdict(job.protocol)))) else {}),
     }
-    with one_thread():
+    with threads(1):
         result = run_episode(
             env,
             actor,
@@ -138,17 +137,6 @@ def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
         clock=Clock(policy.horizon, protocol.delay_steps, protocol.meanwhile),
         tells_jumps=protocol.tells_jumps,
     )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch computes with one thread inside this context."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _place(job: Job) -> tuple[Environment, Any]:

@@ -2,7 +2,8 @@ import pytest
 import small_policy
 import torch
 
-from imfvla.deployment.graphs import example_of, policy_graphs
+from imfvla.command.rehearsal import blank_observation
+from imfvla.deployment.graphs import policy_graphs
 from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.errors import UserError
 from imfvla.types import Observation
@@ -13,7 +14,7 @@ pytest.importorskip("onnxruntime")
 
 def observation(policy, seed):
     rng = torch.Generator().manual_seed(seed)
-    shapes = example_of(policy)
+    shapes = blank_observation(policy)
     return Observation(
         images=torch.randint(0, 256, shapes.images.shape, generator=rng).to(torch.uint8),
         state=torch.randn(shapes.state.shape, generator=rng),
