@@ -14,7 +14,7 @@ ARGS ?=
 HASHES ?=
 
 SHIPPED_dwell := transfer_dwell/seed=0
-SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/generator=imf_plain)
+SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/default)
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --quiet --disable-pip-version-check
