@@ -29,7 +29,7 @@ from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, plain
 from imfvla.training.checkpoint import check_weights
-from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
+from imfvla.training.data import check_episodes, make_loader, prepare_windows, refuse_other_source
 from imfvla.training.experiment import ExperimentOptions
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
@@ -118,6 +118,10 @@ def _run_stages(
     processes: Alone,
 ) -> None:
     """All stages, except the other processes' shares of training."""
+    if options.training.steps not in run.weight_steps() and source_kind(config) != SCRIPTED:
+        check_episodes(
+            config, open_source(config)
+        )  # else the directory would be claimed by a run that cannot be
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         _refuse_other_robot(config, run)

@@ -124,6 +124,13 @@ class FrameStore:
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
         return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action, content)
 
+    @staticmethod
+    def is_current(
+        source: EpisodeSource, store_path: str | Path, image_size: Sequence[int], views: Sequence[str]
+    ) -> bool:
+        """Whether `build` would keep what is at `store_path`, whose episodes it has checked."""
+        return _is_current(Path(store_path), meta_of(source, tuple(views), tuple(image_size)))
+
     @classmethod
     def build(
         cls,
