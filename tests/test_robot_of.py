@@ -56,6 +56,13 @@ def test_what_a_policy_sees_follows_from_its_robot(task, views):
     assert [camera["name"] for camera in config["robot"]["cameras"]] == views
 
 
+def test_a_policy_is_built_for_all_cameras_of_a_robot_that_is_stated():
+    config = compose("train", ["task=none", "demos=mcap", "demos.path=nowhere"])
+    config["task"]["robot"] = robot_of_size(7, 7, num_cameras=2).to_json()
+    assert config["observation"]["views"] is None
+    assert build_policy(config).views == ("camera_0", "camera_1")
+
+
 def test_a_robot_without_cameras_is_named():
     config = compose("train")
     config["task"]["robot"] = robot_of_size(7, 7).to_json() | {"cameras": []}

@@ -10,7 +10,7 @@ from imfvla.data import FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
 from imfvla.options import build
 from imfvla.process.progress import Progress
-from imfvla.robot_of import place_of_robot, robot_of
+from imfvla.robot_of import place_of_robot, robot_of, with_robot
 from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.opening import source_kind
@@ -27,6 +27,7 @@ def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows
 
     Raises UserError where its robot is not the config's, where an episode is damaged, or where nothing can be written.
     """
+    config = with_robot(config)
     robot = robot_of(config)
     refuse_other_source(config, source)
     seen = view_options(config)
