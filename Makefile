@@ -105,5 +105,6 @@ ifdef HASHES  # only files that hashes.txt knows; setuptools first, since some p
 else
 	@if $(PY) -c 'import sys; sys.exit(sys.version_info < (3, 13))'; then $(PIP) install ./tools/labmaze; fi
 	$(PIP) install -c constraints.txt -e '.[dev]'
+	$(PIP) install -c constraints.txt --no-deps gym-pusht # which asks for another OpenCV than ours
 endif
 	@touch $@

@@ -5,12 +5,11 @@ from contextlib import closing
 from typing import Any
 
 from imfvla.config.views import ViewOptions, view_options
-from imfvla.environments import BIMANUAL, environment_of, kind_of
+from imfvla.environments import BIMANUAL, NO_ENVIRONMENT, environment_of, kind_of, seen_in
 from imfvla.options import part_of
 from imfvla.robot import RobotSpec
 
 KEY = "robot"  # of a run's config, its checkpoints' description and a task's YAML
-NO_ENVIRONMENT = "none"  # as task.name: the run trains on data and is judged on data
 
 
 def robot_of(config: Mapping[str, Any]) -> RobotSpec:
@@ -19,9 +18,9 @@ def robot_of(config: Mapping[str, Any]) -> RobotSpec:
     A run's config has it under `robot`; runs from before that key are of the two arms. Raises UserError where it is
     stated wrongly, or where a view has no camera.
     """
-    views = view_options(config)
-    robot = _robot(config, views)
-    for view in views.views:
+    seen = seen_in(config)
+    robot = _robot(config, seen)
+    for view in seen.views or ():
         robot.camera(view)
     return robot
 
@@ -33,8 +32,16 @@ def place_of_robot(config: Mapping[str, Any]) -> str:
 
 
 def with_robot(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The config with its robot resolved, as it goes into a run directory."""
-    return {**config, KEY: robot_of(config).to_json()}
+    """The config with its robot, and the cameras that are seen of it, as it goes into a run directory.
+
+    Raises UserError as `robot_of` does, and where nothing is seen.
+    """
+    robot = robot_of(config)
+    views = seen_in(config).views
+    named = [camera.name for camera in robot.cameras] if views is None else list(views)
+    seen = {**config, "observation": {**config["observation"], "views": named}, KEY: robot.to_json()}
+    view_options(seen)
+    return seen
 
 
 def has_environment(config: Mapping[str, Any]) -> bool:

@@ -9,9 +9,12 @@ import torch
 from any_robot import MemorySource, names_of, robot_of_size
 from fakes import PlainEnvironment
 
+from imfvla.command import experiment
+from imfvla.command.completion import is_complete
 from imfvla.command.composition import compose
 from imfvla.command.experiment import run_experiment
 from imfvla.config.protocol import EvaluationOptions
+from imfvla.errors import UserError
 from imfvla.policy import Policy
 from imfvla.recording import read_episode
 from imfvla.reporting.runs import rows
@@ -32,9 +35,9 @@ TINY = [
 ]  # fmt: skip
 
 
-def configured(robot: RobotSpec, *overrides: str) -> dict:
-    """train.yaml for data of this robot, seen by all of its cameras."""
-    return compose("train", [*TINY, f"observation.views=[{','.join(names_of(robot.cameras))}]", *overrides])
+def configured(*overrides: str) -> dict:
+    """train.yaml for data of a robot; that it is seen by all of its cameras need not be said."""
+    return compose("train", [*TINY, *overrides])
 
 
 def build(robot: RobotSpec, run: Path, step: int) -> tuple[PlainEnvironment, Policy]:
@@ -52,7 +55,7 @@ def trained(tmp_path):
             for episode in MemorySource(robot).episodes:
                 writer.add(episode)
         run = RunDirectory(tmp_path / "run")
-        run_experiment(configured(robot, f"demos.path={tmp_path}/demos", *overrides), run)
+        run_experiment(configured(f"demos.path={tmp_path}/demos", *overrides), run)
         return run
 
     return train
@@ -68,6 +71,7 @@ def test_a_robot_of_any_shape_goes_from_recordings_to_a_row_of_a_table(
     run = trained(robot)
     assert run.status()["state"] == DONE
     assert robot_of(run.config()) == robot
+    assert run.config()["observation"]["views"] == list(names_of(robot.cameras))
 
     policy = load_policy(run)
     assert policy.robot == robot
@@ -98,7 +102,23 @@ def test_a_robot_of_any_shape_goes_from_recordings_to_a_row_of_a_table(
     "core",
     ["core=act generator=act evaluation.nfe=[1]", "core=smolvla encoder=smolvla/cpu generator=smolvla"],
 )
-def test_other_cores_take_their_sizes_from_the_robot_too(trained, core):
+def test_other_cores_take_their_sizes_from_the_robot_too(trained, core, tmp_path):
     robot = robot_of_size(8, 9, num_cameras=2)
-    policy = load_policy(trained(robot, *core.split()))
-    assert policy.noise_shape == (8, 8)
+    run = trained(robot, *core.split())
+    assert load_policy(run).noise_shape == (8, 8)
+    assert is_complete(configured(f"demos.path={tmp_path}/demos", *core.split()), run.path)
+
+
+def test_a_number_that_is_not_finite_is_named_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    robot = robot_of_size(7, 7)
+    source = MemorySource(robot)
+    source.episodes[1].state[2, 3] = float("nan")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(experiment, "open_source", lambda config: source)
+    config = configured("demos.path=demos")
+    config["task"]["robot"] = robot.to_json()
+    with pytest.raises(
+        UserError, match=rf"{source.episodes[1].name}: state of .* must be finite, found nan at step 2"
+    ):
+        run_experiment(config, RunDirectory("run"))
+    assert list(tmp_path.iterdir()) == []

@@ -34,7 +34,7 @@ from imfvla.sources.mcap import McapSource
 from imfvla.storage.documents import MAX_YAML_VALUES
 from imfvla.storage.metrics import read_metrics
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import TrainState, load_state, save_state
+from imfvla.training.train_state import TrainState, load_state, save_state
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))

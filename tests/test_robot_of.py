@@ -40,6 +40,37 @@ def test_our_own_tasks_have_two_arms_and_a_task_may_state_its_robot():
     assert robot_of(stated) == other
 
 
+@pytest.mark.parametrize(
+    ("task", "views"),
+    [
+        (["task=socket"], ["front", "top", "r_wrist"]),
+        (["task=gate", "observation.views=[top]"], ["top"]),
+        (["task=gate", "observation.views=null"], ["front", "top", "r_wrist"]),
+        (["task=pusht"], ["top"]),
+        (["task=pusht", "observation.views=null"], ["top"]),
+    ],
+)
+def test_what_a_policy_sees_follows_from_its_robot(task, views):
+    config = with_robot(compose("train", task))
+    assert config["observation"]["views"] == views
+    assert [camera["name"] for camera in config["robot"]["cameras"]] == views
+
+
+def test_a_policy_is_built_for_all_cameras_of_a_robot_that_is_stated():
+    config = compose("train", ["task=none", "demos=mcap", "demos.path=nowhere"])
+    config["task"]["robot"] = robot_of_size(7, 7, num_cameras=2).to_json()
+    assert config["observation"]["views"] is None
+    assert build_policy(config).views == ("camera_0", "camera_1")
+
+
+def test_a_robot_without_cameras_is_named():
+    config = compose("train")
+    config["task"]["robot"] = robot_of_size(7, 7).to_json() | {"cameras": []}
+    config["observation"]["views"] = None
+    with pytest.raises(UserError, match=r"observation\.views must be one or more views, found \[\]"):
+        with_robot(config)
+
+
 def test_a_view_without_a_camera_is_named():
     config = compose("train")
     config["task"]["robot"] = robot_of_size(7, 7).to_json()

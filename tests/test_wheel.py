@@ -111,7 +111,7 @@ def test_a_data_set_of_lerobot_is_trained_on_judged_and_written_back(unpacked, t
         for number in range(3):
             writer.add(episode(number))
     train = "import imfvla.scripts; imfvla.scripts.train()"
-    data = ["task=none", "demos=lerobot", "demos.path=arm", "observation.views=[front]", "name=mine"]
+    data = ["task=none", "demos=lerobot", "demos.path=arm", "name=mine"]
     done = run(unpacked, tmp_path, "-c", train, *data, "task.held_out=1", *TINY)
     assert done.returncode == 0, done.stderr
     (table,) = tmp_path.glob("runs/mine/*/offline.md")

@@ -23,7 +23,7 @@ from unittest import mock
 import numpy as np
 
 from imfvla.data import FrameStore, checksums
-from imfvla.data.frame_store import ARRAYS
+from imfvla.data.store_format import ARRAYS
 from imfvla.recording import Recordings
 from imfvla.sources.mcap import McapSource
 

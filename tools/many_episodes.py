@@ -76,7 +76,7 @@ def prepare(episodes: int, folder: Path) -> tuple[dict[str, Any], Drawn, dict[st
 def write_store(episodes: int, folder: Path) -> None:
     """The arrays of a frame store: walks, actions that follow them, and a sparse file of black pictures."""
     from imfvla.data.checksums import with_checksums
-    from imfvla.data.frame_store import ARRAYS, IMAGES, meta_of
+    from imfvla.data.store_format import ARRAYS, IMAGES, meta_of
     from imfvla.training.data import store_path
 
     config, source, _ = prepare(episodes, folder)

@@ -33,12 +33,12 @@ from imfvla.data.statistics import Statistics
 from imfvla.policy import build_policy
 from imfvla.robot_of import robot_of
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import save_state
 from imfvla.training.experiment import read_experiment
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import joined_processes
 from imfvla.training.sharding import SHARDINGS
+from imfvla.training.train_state import save_state
 from imfvla.types import MAX_WORDS, Batch, Observation
 
 STEPS = 2

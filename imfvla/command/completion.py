@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.views import VIEWS, view_options
 from imfvla.errors import UserError
 from imfvla.options import build
 from imfvla.reporting.offline import read_offline
@@ -49,7 +50,8 @@ def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> b
     if run.status().get("state") != DONE:
         return False
     found = run.config()
-    if differences(found, plain(config), EXECUTION_KEYS):
+    unsaid = (VIEWS,) if view_options(config).views is None else ()  # a run says what its data has
+    if differences(found, plain(config), (*EXECUTION_KEYS, *unsaid)):
         return False
     wanted = config["evaluation"]
     if not has_environment(config):

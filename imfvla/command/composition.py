@@ -28,6 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from imfvla.command.missing import refuse_missing
 from imfvla.config.assets import folder, install_command, shown
+from imfvla.environments import usual_views
 from imfvla.errors import UserError
 from imfvla.options import require, suggestion
 from imfvla.storage.run_names import key_of, run_name
@@ -114,9 +115,10 @@ def plain_name(name: str) -> str:
 
 
 def register_resolvers() -> None:
-    """Makes `run_name` and `plain_name` known to the configs, as `${plain_name:text}`. May be called again."""
+    """Makes these functions known to the configs, as `${plain_name:text}`. May be called again."""
     OmegaConf.register_new_resolver("plain_name", plain_name, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+    OmegaConf.register_new_resolver("usual_views", usual_views, replace=True)
 
 
 def refuse_added_keys(config_name: str, overrides: Sequence[str], more: Path | None = None) -> None:

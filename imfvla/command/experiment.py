@@ -24,12 +24,13 @@ from imfvla.reporting.table_row import print_row
 from imfvla.robot_of import has_environment, robot_of, with_robot
 from imfvla.rollouts.evaluation import evaluate, refuse_long_delay
 from imfvla.rollouts.offline import evaluate_offline
+from imfvla.sources.base import EpisodeSource
 from imfvla.sources.collection import check_demonstrations
 from imfvla.sources.opening import SCRIPTED, open_source, source_kind
 from imfvla.sources.same_robot import refuse_other_robot
 from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, RunDirectory, plain
 from imfvla.training.checkpoint import check_weights
-from imfvla.training.data import make_loader, prepare_windows, refuse_other_source
+from imfvla.training.data import check_episodes, make_loader, prepare_windows, refuse_other_source
 from imfvla.training.experiment import ExperimentOptions
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
@@ -53,8 +54,9 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     policy = rehearse(
         config, options.evaluation.nfe, options.evaluation.noise_scale, options.evaluation.noise
     )
+    source = None
     if not is_trained:
-        _check_source(config)
+        source = _check_source(config)
         if not run.last_state.exists():
             initialise_from_pretrained(policy)
     run.refuse_strangers()
@@ -64,7 +66,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
         if not is_trained:
             processes.check(options.training)
         if processes.is_first:
-            _run_stages(config, options, run, overrides, processes)
+            _run_stages(config, options, run, overrides, processes, source)
         elif processes.first_of(STAGES, TRAIN) == TRAIN:
             _train(config, options, run, processes)
 
@@ -97,17 +99,21 @@ def _check_environment(config: Mapping[str, Any]) -> None:
         )
 
 
-def _check_source(config: Mapping[str, Any]) -> None:
-    """Raises UserError where the episodes to learn from do not exist, or are of another robot; records none."""
+def _check_source(config: Mapping[str, Any]) -> EpisodeSource | None:
+    """The data to learn from, None where an expert will record it.
+
+    Raises UserError where there is none, or of another robot; records nothing.
+    """
     if source_kind(config) == SCRIPTED:
         require(
             has_environment(config), "demos", "a source of data where task=none, such as demos=mcap", SCRIPTED
         )
         check_demonstrations(config)
-        return
+        return None
     source = open_source(config)
     refuse_other_source(config, source)
     held_out(config["task"], len(source))
+    return source
 
 
 def _run_stages(
@@ -116,8 +122,11 @@ def _run_stages(
     run: RunDirectory,
     overrides: Sequence[str],
     processes: Alone,
+    source: EpisodeSource | None,
 ) -> None:
-    """All stages, except the other processes' shares of training."""
+    """All stages, except the other processes' shares of training. source: data whose numbers are to be checked."""
+    if source is not None:
+        check_episodes(config, source)  # before the directory is claimed
     with run.lock():
         run.claim(config, ignored=EXECUTION_KEYS)
         _refuse_other_robot(config, run)

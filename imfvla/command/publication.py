@@ -19,8 +19,8 @@ from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.figures.style import render
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
-from imfvla.reporting.mapping import COMPARISONS, SETTINGS, TableTitle
 from imfvla.reporting.mapping import Mapping as RowMapping
+from imfvla.reporting.mapping_tables import COMPARISONS, SETTINGS, TableTitle
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import read_offline
 from imfvla.reporting.offline_tables import offline_table

@@ -6,22 +6,26 @@ from typing import Any
 
 from imfvla.options import build, part_of, require
 
-SIZE = "observation.image_size"
+VIEWS, SIZE = "observation.views", "observation.image_size"
 SMALLEST = 8  # pixels of a side
 MAX_PIXELS = 4096 * 4096  # of one picture: a small file can state a size that fills the memory
 
 
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """Cameras by name, in order, and the size (H, W) [px] of their pictures. UserError where they make no sense."""
+    """Cameras by name, in order, and the size (H, W) [px] of their pictures. UserError where they make no sense.
 
-    views: tuple[str, ...]
+    views: None for all that the robot has, which `imfvla.robot_of.with_robot` names.
+    """
+
+    views: tuple[str, ...] | None
     image_size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        key, names = "observation.views", list(self.views)
-        require(bool(names), key, "one or more views", names)
-        require(len(set(names)) == len(names), key, "views that all differ", names)
+        if self.views is not None:
+            names = list(self.views)
+            require(bool(names), VIEWS, "one or more views", names)
+            require(len(set(names)) == len(names), VIEWS, "views that all differ", names)
         height, width = self.image_size
         wanted = f"[height, width] of at least {SMALLEST} pixels each and at most {MAX_PIXELS} in all"
         fits = min(height, width) >= SMALLEST and height * width <= MAX_PIXELS

@@ -3,59 +3,22 @@
 Shapes: N frames, V views, H W pixels, T control steps of all episodes, S state, A action.
 """
 
-import hashlib
-import json
 import math
-import os
-import shutil
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
 import numpy as np
 
-from imfvla.data.checksums import checked_sums, digest_of, remember, with_checksums
-from imfvla.data.resample import resample
+from imfvla.data.checksums import checked_sums, digest_of
+from imfvla.data.store_format import ARRAYS, FORMAT, IMAGES, StoreMeta, is_made_from, meta_of
+from imfvla.data.store_writing import Progress, write_store
 from imfvla.errors import UserError
-from imfvla.options import at_most, of_length, within, within_length
-from imfvla.robot import MAX_CAMERAS, MAX_SIDE
-from imfvla.sources.base import EpisodeArrays, EpisodeSource
-from imfvla.sources.validation import check_episode
-from imfvla.storage.documents import read_json
-from imfvla.storage.files import clear_folder, locked, make_folder, put_folder, write_remedy
+from imfvla.sources.base import EpisodeSource
+from imfvla.storage.files import clear_folder, locked
 from imfvla.storage.opening import ARRAY, checked
 from imfvla.storage.records import read_record
-
-FORMAT = 2
-IMAGES = "images.raw"
-ARRAYS = (IMAGES, "image_steps.npy", "state.npy", "action.npy")
-FILES = {*ARRAYS, "meta.json"}
-NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
-
-Progress = Callable[[int, int], None]  # called with (episodes done, episodes in all)
-
-
-class EpisodeEntry(TypedDict):
-    """An episode in `meta.json`."""
-
-    name: str
-    task: str
-    instructions: Annotated[list[Annotated[str, at_most(10_000)]], within_length(1, 10_000)]
-    num_steps: Annotated[int, within(1, 10**7)]
-    num_frames: Annotated[int, within(0, 10**7)]
-
-
-class StoreMeta(TypedDict):
-    """`meta.json`."""
-
-    format: int
-    digest: str
-    views: Annotated[list[str], within_length(1, MAX_CAMERAS)]
-    image_size: Annotated[list[Annotated[int, within(1, MAX_SIDE)]], of_length(2)]
-    episodes: list[EpisodeEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +87,13 @@ class FrameStore:
         views, image_size = tuple(meta["views"]), tuple(meta["image_size"])
         return cls(path, views, image_size, tuple(episodes), images, image_steps, state, action, content)
 
+    @staticmethod
+    def is_current(
+        source: EpisodeSource, store_path: str | Path, image_size: Sequence[int], views: Sequence[str]
+    ) -> bool:
+        """Whether `build` would keep what is at `store_path`, whose episodes it has checked."""
+        return is_made_from(Path(store_path), meta_of(source, tuple(views), tuple(image_size)))
+
     @classmethod
     def build(
         cls,
@@ -148,8 +118,8 @@ class FrameStore:
         meta = meta_of(source, tuple(views), tuple(image_size))
         with locked(store_path):
             clear_folder(store_path)
-            if not _is_current(store_path, meta):
-                _write(source, store_path, meta, progress or (lambda done, total: None))
+            if not is_made_from(store_path, meta):
+                write_store(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
 
 
@@ -169,107 +139,10 @@ def _check_arrays(
         raise ValueError("image_steps are not all of its episodes' steps")
 
 
-def meta_of(source: EpisodeSource, views: tuple[str, ...], image_size: tuple[int, int]) -> dict[str, Any]:
-    """What a store is made from, as in its meta.json; the digest shows whether the store is up to date."""
-    content = json.dumps([FORMAT, views, image_size, source.digest()])
-    return {
-        "format": FORMAT,
-        "digest": hashlib.sha256(content.encode()).hexdigest(),
-        "views": list(views),
-        "image_size": list(image_size),
-    }
-
-
 def _digest_of_episodes(meta: Mapping[str, Any]) -> str:
     """Of what a training takes from meta.json: not the names, which only messages need."""
     entries = [{key: entry[key] for key in entry if key != "name"} for entry in meta["episodes"]]
     return digest_of([meta["views"], meta["image_size"], entries])
-
-
-def _is_current(store_path: Path, meta: dict[str, Any]) -> bool:
-    try:
-        return read_json(store_path / "meta.json", "", mapping=True).get("digest") == meta["digest"]
-    except UserError:
-        return False
-
-
-def _write(source: EpisodeSource, store_path: Path, meta: dict[str, Any], progress: Progress) -> None:
-    """Writes a complete store beside `store_path` and moves it there."""
-    if store_path.exists() and not (store_path.is_dir() and _names(store_path) <= FILES):
-        raise UserError(
-            f"{store_path} is the place of decoded frames, but is not a frame store: move it away, or choose another "
-            "folder with demos.frames_directory."
-        )
-    part = store_path.with_name(f".{store_path.name}.part")
-    needed = _num_frames(source, meta["views"]) * len(meta["views"]) * 3 * math.prod(meta["image_size"])
-    try:
-        make_folder(store_path.parent)
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
-        if (free := shutil.disk_usage(part).free) < needed:
-            raise UserError(
-                f"Frame store {store_path} needs {needed / 1e9:.1f} GB, found {free / 1e9:.1f} GB free: free disk "
-                "space, choose another disk with demos.frames_directory, or lower observation.image_size or the "
-                "number of views."
-            )
-        written = _write_arrays(source, part, meta, progress)
-        put_folder(part, store_path)
-        remember(store_path, written, ARRAYS)
-    except OSError as error:
-        raise UserError(
-            f"Cannot write frame store {store_path}: {error.strerror or error}; choose another folder with "
-            f"demos.frames_directory, or {write_remedy(error)}."
-        ) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-def _names(store_path: Path) -> set[str]:
-    """The files of a store, without those that NFS and FUSE keep while a process has them open."""
-    return {name for name in os.listdir(store_path) if not name.startswith((".nfs", ".fuse_hidden"))}
-
-
-def _num_frames(source: EpisodeSource, views: Sequence[str]) -> int:
-    """Frames of each view. Raises UserError where there are none."""
-    found = sum(source.num_frames(index) for index in range(len(source)))
-    if found == 0:
-        raise UserError(
-            f"The {len(source)} episodes of demos have no frames of {', '.join(views)}: change observation.views, or "
-            "collect again with these views."
-        )
-    return found
-
-
-def _write_arrays(
-    source: EpisodeSource, part: Path, meta: dict[str, Any], progress: Progress
-) -> dict[str, Any]:
-    """Fills the folder `part`; returns the content of its meta.json."""
-    entries, steps, states, actions = [], [], [], []
-    with open(part / IMAGES, "wb") as stream:
-        for episode, frames in _decoded(source, meta["views"], meta["image_size"]):
-            stream.write(frames)
-            entry = {
-                "name": episode.name,
-                "task": episode.task,
-                "instructions": list(episode.instructions),
-                "num_steps": len(episode.state),
-                "num_frames": len(episode.image_steps),
-            }
-            entries.append(entry)
-            steps.append(episode.image_steps)
-            states.append(episode.state)
-            actions.append(episode.action)
-            progress(len(entries), len(source))
-    _save(part / "image_steps.npy", np.concatenate(steps))
-    _save(part / "state.npy", np.concatenate(states))
-    _save(part / "action.npy", np.concatenate(actions))
-    meta = with_checksums(meta | {"episodes": entries}, part, ARRAYS)
-    (part / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
-    return meta
-
-
-def _save(path: Path, array: np.ndarray) -> None:
-    np.save(path, array, allow_pickle=False)
 
 
 def _load(path: Path) -> np.ndarray:
@@ -286,30 +159,3 @@ def _mapped(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
     if size != wanted:
         raise ValueError(f"{path.name} has {size} bytes, wanted {wanted}")
     return np.asarray(np.memmap(checked(path, ARRAY), kind, "r", shape=shape))
-
-
-def _decoded(
-    source: EpisodeSource, views: Sequence[str], image_size: Sequence[int]
-) -> Iterator[tuple[EpisodeArrays, np.ndarray]]:
-    """Episodes in order with their frames, decoded by threads that stay a few episodes ahead."""
-    ahead: deque[Future[tuple[EpisodeArrays, np.ndarray]]] = deque()
-    with ThreadPoolExecutor(NUM_DECODERS) as threads:
-        for index in range(len(source)):
-            ahead.append(threads.submit(_decode, source, index, views, image_size))
-            if len(ahead) > 2 * NUM_DECODERS:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
-
-
-def _decode(
-    source: EpisodeSource, index: int, views: Sequence[str], image_size: Sequence[int]
-) -> tuple[EpisodeArrays, np.ndarray]:
-    """The episode and its frames: contiguous uint8 (K, V, 3, H, W)."""
-    episode = source.episode(index, views)
-    check_episode(episode, source.robot, views)
-    frames = np.empty((len(episode.image_steps), len(views), 3, *image_size), np.uint8)
-    for number, view in enumerate(views):
-        for frame, picture in zip(frames[:, number], episode.images[view], strict=True):
-            frame[...] = resample(picture, image_size).transpose(2, 0, 1)
-    return replace(episode, images={}), frames

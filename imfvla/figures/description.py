@@ -7,7 +7,7 @@ from typing import Any
 
 from imfvla.environments import BIMANUAL
 from imfvla.robot import bare_name, unit_of
-from imfvla.robot_of import has_environment, robot_of
+from imfvla.robot_of import has_environment, robot_of, with_robot
 
 VISION = {"CompactCNN": "compact CNN", "CompactResNet": "compact ResNet", "ResNet18": "ResNet18"}
 CORE = {
@@ -105,6 +105,7 @@ class Method:
 
 def describe(config: Mapping[str, Any]) -> Method:
     """The method of a config that `conf/train.yaml` composed."""
+    config = with_robot(config)
     robot = robot_of(config)
     encoder, core, generator = config["encoder"], config["core"], config["generator"]
     residual = core.get("residual", {})

@@ -3,7 +3,8 @@
 import re
 from functools import cache
 
-from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import Evaluation
 

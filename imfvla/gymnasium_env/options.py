@@ -88,7 +88,7 @@ def read_task(task: Mapping[str, Any], observation: Mapping[str, Any]) -> Gymnas
         )
     robot = RobotSpec.from_json(keys.robot, "task.robot")
     seen = {key: observation.get(key) for key in ViewOptions.__slots__ if key in observation}
-    views = build(ViewOptions, seen, "observation").views
+    views = build(ViewOptions, seen, "observation").views or tuple(camera.name for camera in robot.cameras)
     pictures = _texts(keys.pictures, "task.pictures")
     for view in views:
         robot.camera(view)

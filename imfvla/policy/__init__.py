@@ -19,7 +19,7 @@ from imfvla.generators.base import Generator, HasStages, draws_noise
 from imfvla.policy.budget import SizeBudget
 from imfvla.policy.chunks import ChunkFrame
 from imfvla.robot import RobotSpec
-from imfvla.robot_of import robot_of
+from imfvla.robot_of import robot_of, with_robot
 from imfvla.types import Batch, Observation
 
 
@@ -129,6 +129,7 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
     parts do not fit together.
     """
     try:
+        config = with_robot(config)
         horizon, robot, seen = Horizon(**config["horizon"]), robot_of(config), view_options(config)
         chunks = ChunkFrame(config["action_frame"], horizon.pred, robot)
         with SizeBudget():

@@ -11,7 +11,7 @@ from imfvla.reporting.contrasts import (
     success_difference,
     success_ratio,
 )
-from imfvla.reporting.mapping import Comparison
+from imfvla.reporting.mapping_comparisons import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result

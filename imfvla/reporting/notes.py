@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 from imfvla.reporting.cells import BY_NAME
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping import Comparison, TableRow
+from imfvla.reporting.mapping_comparisons import Comparison
+from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
 
 

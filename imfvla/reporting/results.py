@@ -5,7 +5,7 @@ from functools import cached_property
 
 from imfvla.reporting.answers import Answer, Evaluated
 from imfvla.reporting.estimates import wilson_interval
-from imfvla.reporting.mapping import TableRow
+from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow

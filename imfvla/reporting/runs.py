@@ -9,7 +9,8 @@ from typing import Any
 from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL, as_recorded, unusual
 from imfvla.errors import UserError
 from imfvla.options import require
-from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.recomputed import recomputed
 from imfvla.reporting.records import Row, Summary
 from imfvla.storage.documents import read_json

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
-from imfvla.reporting.mapping import TableTitle
+from imfvla.reporting.mapping_tables import TableTitle
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result

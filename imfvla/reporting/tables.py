@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 from imfvla.reporting.cells import BY_NAME, SHOWN, TITLES, printed, with_its_interval
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping import Comparison
+from imfvla.reporting.mapping_comparisons import Comparison
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.notes import detectable_success, label, names, pairing

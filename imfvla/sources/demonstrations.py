@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 from imfvla import tasks
-from imfvla.config.views import view_options
 from imfvla.environment import Environment
-from imfvla.environments import BIMANUAL, GYMNASIUM, KIND, environment_of, kind_of
+from imfvla.environments import BIMANUAL, GYMNASIUM, KIND, environment_of, kind_of, seen_in
 from imfvla.episode import Actor
 from imfvla.errors import UserError
 from imfvla.options import build, part_of, require
@@ -127,7 +126,7 @@ def settings_of(
     task: Mapping[str, Any], observation: Mapping[str, Any], camera_every: int, where: str
 ) -> Settings:
     """The checked settings of a collection; `where` is the key of `camera_every`. Raises UserError."""
-    shown = view_options({"observation": observation})
+    shown = seen_in({"task": task, "observation": observation})
     if kind_of(task) == GYMNASIUM:
         return _gymnasium_settings(task, asdict(shown), camera_every, where)
     if kind_of(task) != BIMANUAL:

@@ -14,6 +14,7 @@ TIME_LIMIT_STEPS = 700  # of an episode of every task
 # By `task.expert.modes`: the wrists whose way is drawn. Hands point down, so that a wrist's roll is the gripper's yaw.
 DRAWN_WRISTS = {1: (), 2: ("right/joint_7",), 4: ("left/joint_7", "right/joint_7")}
 ALL_VIEWS = ("front", "top", "r_wrist", "l_wrist")
+USUAL_VIEWS = ALL_VIEWS[:3]  # of a policy that is not told which cameras it sees
 LARGEST_PICTURE = (960, 1280)  # (H, W) [px]; the scene has a buffer of this size to draw into
 
 

@@ -10,11 +10,12 @@ from imfvla.data import FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
 from imfvla.options import build
 from imfvla.process.progress import Progress
-from imfvla.robot_of import place_of_robot, robot_of
+from imfvla.robot_of import place_of_robot, robot_of, with_robot
 from imfvla.sources.base import EpisodeSource
 from imfvla.sources.mcap import McapSource
 from imfvla.sources.opening import source_kind
 from imfvla.sources.same_robot import refuse_other_data
+from imfvla.sources.validation import check_episode
 from imfvla.training.experiment import ExperimentOptions
 
 STORES = Path("data/frames")  # of sources that are no folder of recordings
@@ -26,6 +27,7 @@ def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows
 
     Raises UserError where its robot is not the config's, where an episode is damaged, or where nothing can be written.
     """
+    config = with_robot(config)
     robot = robot_of(config)
     refuse_other_source(config, source)
     seen = view_options(config)
@@ -41,6 +43,20 @@ def prepare_windows(config: Mapping[str, Any], source: EpisodeSource) -> Windows
     horizon = build(Horizon, config["horizon"], "horizon")
     trained = set(range(len(source))) - set(kept)
     return Windows(store, horizon, robot, paraphrases=config["task"]["paraphrases"], episodes=trained)
+
+
+def check_episodes(config: Mapping[str, Any], source: EpisodeSource) -> None:
+    """Reads the numbers of all episodes, without pictures, unless the frame store shows that they were read before.
+
+    Raises UserError naming the first episode that is damaged, or has a number that is not finite.
+    """
+    seen = view_options(config)
+    if FrameStore.is_current(source, store_path(config, source), seen.image_size, seen.views):
+        return
+    with Progress("checking episodes", len(source)) as bar:
+        for index in range(len(source)):
+            check_episode(source.episode(index), source.robot, ())
+            bar.advance()
 
 
 def held_out_windows(windows: Windows) -> Windows:

@@ -22,7 +22,7 @@ from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped, deferred_stop
 from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import TrainState, load_state, save_state, save_weights
+from imfvla.training.checkpoint import save_weights
 from imfvla.training.clipping import Clipping
 from imfvla.training.ema import Ema
 from imfvla.training.logger import MetricsLogger, SilentLogger
@@ -35,6 +35,7 @@ from imfvla.training.precision import PRECISIONS, autocast, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.training.sharding import FULL, release, shard, whole
 from imfvla.training.spans import Span, Spans
+from imfvla.training.train_state import TrainState, load_state, save_state
 from imfvla.types import Batch
 
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws

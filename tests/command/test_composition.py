@@ -28,7 +28,7 @@ from imfvla.errors import UserError
             ["horizon=[1]"],
             r"^horizon must be a mapping of keys to values, found a list: write it as in .*conf\.",
         ),
-        (["observation.views={front: 1}"], r"^observation\.views must be a list, found a mapping"),
+        (["evaluation.nfe={one: 1}"], r"^evaluation\.nfe must be a list, found a mapping"),
     ],
 )
 def test_mistakes_get_one_sentence_with_the_names_that_exist(overrides, message):

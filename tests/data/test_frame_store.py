@@ -131,7 +131,7 @@ def test_too_little_room_is_noticed_before_decoding(synthetic_demonstrations, tm
     class Full:
         free = 1000
 
-    monkeypatch.setattr("imfvla.data.frame_store.shutil.disk_usage", lambda path: Full)
+    monkeypatch.setattr("imfvla.data.store_writing.shutil.disk_usage", lambda path: Full)
     with pytest.raises(UserError, match=r"needs 0\.0 GB, found 0\.0 GB free"):
         FrameStore.build(McapSource.of(synthetic_demonstrations), tmp_path / "store", (32, 32), VIEWS)
 

@@ -11,7 +11,7 @@ from imfvla.gymnasium_env import load
 
 @pytest.fixture(scope="module")
 def env():
-    config = compose("train", ["task=pusht", "observation.views=[top]", "observation.image_size=[48,48]"])
+    config = compose("train", ["task=pusht", "observation.image_size=[48,48]"])
     return load(config["task"], config["observation"])
 
 

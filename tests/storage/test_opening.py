@@ -35,8 +35,9 @@ from imfvla.storage.opening import (
 )
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.run_log import RunLog
-from imfvla.training.checkpoint import load_weights, read_tensors
+from imfvla.training.checkpoint import load_weights
 from imfvla.training.logger import MetricsLogger, read_metrics
+from imfvla.training.tensor_files import read_tensors
 
 READERS = {
     "status.json": lambda path: RunDirectory(path.parent).status(),

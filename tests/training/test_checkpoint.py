@@ -8,8 +8,9 @@ from tiny_policy import TinyPolicy
 
 from imfvla.errors import UserError
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training import checkpoint
-from imfvla.training.checkpoint import load_weights, read_tensors, save_weights
+from imfvla.training import checkpoint, tensor_files, train_state
+from imfvla.training.checkpoint import load_weights, save_weights
+from imfvla.training.tensor_files import read_tensors
 
 
 def test_weights_come_back_bit_for_bit(tmp_path):
@@ -95,7 +96,7 @@ def test_state_of_another_policy_is_refused(tmp_path, make_trainer):
 class TestFullDisk:
     def fill_at(self, monkeypatch, nth):
         """The nth writing of tensors, counted from 1, finds the disk full after some bytes."""
-        calls, original = [], checkpoint.write_tensors
+        calls, original = [], tensor_files.write_tensors
 
         def write(path, tensors, header):
             calls.append(path)
@@ -104,7 +105,8 @@ class TestFullDisk:
                 raise OSError(errno.ENOSPC, "No space left on device")
             original(path, tensors, header)
 
-        monkeypatch.setattr(checkpoint, "write_tensors", write)
+        for writer in (checkpoint, train_state):
+            monkeypatch.setattr(writer, "write_tensors", write)
 
     def test_state_of_before_is_intact(self, tmp_path, make_trainer, monkeypatch):
         self.fill_at(monkeypatch, 2)
@@ -125,13 +127,13 @@ class TestFullDisk:
 
     def test_system_error_inside_safetensors_is_reported(self, tmp_path, monkeypatch):
         def fails(*_, **__):
-            raise checkpoint.SafetensorError(
+            raise tensor_files.SafetensorError(
                 'Error: I/O error: No space left on device (os error 28) at path "/a"'
             )
 
-        monkeypatch.setattr(checkpoint, "save_file", fails)
+        monkeypatch.setattr(tensor_files, "save_file", fails)
         with pytest.raises(OSError, match="No space left") as caught:
-            checkpoint.write_tensors(tmp_path / "x", {}, {})
+            tensor_files.write_tensors(tmp_path / "x", {}, {})
         assert caught.value.errno == errno.ENOSPC
 
 

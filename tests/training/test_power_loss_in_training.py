@@ -5,8 +5,8 @@ import json
 from losing_disk import watch
 
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
+from imfvla.training.tensor_files import read_tensors
 
 
 def test_a_state_on_disk_is_whole_and_has_its_rows(tmp_path, make_trainer):

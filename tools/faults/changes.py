@@ -21,7 +21,7 @@ from faults.outcome import Differs
 from faults.work import roll_out
 from imfvla.config.horizon import Horizon
 from imfvla.data import FrameStore, Loader, ResumableSampler, Windows, checksums
-from imfvla.data.frame_store import ARRAYS, IMAGES
+from imfvla.data.store_format import ARRAYS, IMAGES
 from imfvla.errors import UserError
 from imfvla.reporting.answers import refuse_copies
 from imfvla.reporting.runs import evaluations

@@ -15,7 +15,7 @@ from faults.killing import POLL_S, Work, ended_or_late, half_written, progress_o
 from faults.outcome import Differs, compare, state_of
 from faults.work import train
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import read_tensors
+from imfvla.training.tensor_files import read_tensors
 
 
 def disk(folder: Path, kills: int, rng: random.Random) -> str:

@@ -9,8 +9,8 @@ import torch
 from imfvla.recording import read_episode
 from imfvla.reporting.rows import untimed
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
+from imfvla.training.tensor_files import read_tensors
 
 TIMES = {"steps_per_s", "data_wait_fraction", "train_s"}
 NOT_OF_WORK = {"train_s", "code", "earlier_code"}  # of a state's header: somebody may commit in the meantime

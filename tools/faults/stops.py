@@ -12,8 +12,8 @@ from faults.killing import POLL_S, ended_or_late, progress_of, start, undisturbe
 from faults.outcome import Differs, compare, state_of
 from faults.work import train
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import read_tensors
 from imfvla.training.logger import read_metrics
+from imfvla.training.tensor_files import read_tensors
 
 
 def stops(folder: Path, kills: int, rng: random.Random) -> str:

@@ -37,7 +37,8 @@ from imfvla.sources.mcap import McapSource
 from imfvla.storage.files import write_json
 from imfvla.storage.metrics import read_metrics
 from imfvla.storage.run_directory import RunDirectory
-from imfvla.training.checkpoint import TrainState, load_state, load_weights, save_state, save_weights
+from imfvla.training.checkpoint import load_weights, save_weights
+from imfvla.training.train_state import TrainState, load_state, save_state
 
 SLOW = {"config", "options", "tables"}  # YAML, and a policy that is built
 QUICK = 16
