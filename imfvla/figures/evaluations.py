@@ -10,6 +10,7 @@ from imfvla.figures.names import policy_of
 from imfvla.figures.panels import look, nfe_ticks, say_nothing_yet, tasks_of
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
+from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.results import Result
 
 COLUMNS = 3
@@ -17,8 +18,19 @@ Line = list[Result]
 
 
 def success_by_evaluations(results: Sequence[Result]) -> Figure:
-    """Policies evaluated at several NFE, with the weights at the end of training and Wilson intervals."""
-    last = sorted((result for result in results if result.is_last), key=lambda result: result.policy)
+    """Policies evaluated at several NFE, with the weights at the end of training and Wilson intervals.
+
+    Tables that are not the paper's and have a figure of their own are left out.
+    """
+    mapping = read_mapping()
+    elsewhere = {
+        row.experiment
+        for table in mapping.of_rows
+        if table.printed is None and table.figure is not None
+        for row in mapping.of_table(table.name)
+    }
+    shown = [result for result in results if result.is_last and _experiment(result) not in elsewhere]
+    last = sorted(shown, key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]
     titles = tasks_of([line[0] for line in lines])
@@ -74,6 +86,10 @@ def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
                       **look(changes.index(change)))  # fmt: skip
     ticks = nfe_ticks(axes, (result.nfe for line in lines for result in line))
     axes.set_xlim(0.75 * ticks[0], 1.35 * ticks[-1])
+
+
+def _experiment(result: Result) -> str:
+    return result.evaluated[0].evaluation.experiment
 
 
 def _policy(line: Line) -> tuple[str, str]:
