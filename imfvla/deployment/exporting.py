@@ -86,7 +86,7 @@ def export_policy(
                 )
             )
             bar.advance()
-    _write(folder, files, cards)
+    write_folder(folder, files, cards)
     columns = ("nfe", "Eager [ms]", "ONNX Runtime [ms]", "Ratio", "Largest difference")
     note = (
         f"One thread, medians of {calls} predictions in turn. Differences over {len(observed)} observations."
@@ -115,7 +115,11 @@ def _interface(policy: Policy) -> dict[str, Any]:
     }
 
 
-def _write(folder: Path, files: dict[str, bytes], cards: dict[str, dict[str, Any]]) -> None:
+def write_folder(folder: Path, files: dict[str, bytes], cards: dict[str, dict[str, Any]]) -> None:
+    """Makes `folder` of graphs and cards, whole or not at all.
+
+    Raises UserError where it exists, or cannot be written.
+    """
     part = folder.with_name(f".{folder.name}.part")
     with clear_write_errors(folder):
         make_folder(folder.parent)

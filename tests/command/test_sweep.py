@@ -181,7 +181,8 @@ def test_a_job_that_was_killed_elsewhere_is_told_in_a_sentence(tmp_path):
         "A job ended without a result, as one does that is killed (Job 7 has not produced any output). Rerun"
     )
     assert other.text == "Not finished yet; it may still be running."
-    assert one.is_user_error and other.is_user_error
+    assert one.is_user_error
+    assert other.is_user_error
 
 
 def test_an_unknown_launcher_is_reported_with_where_it_comes_from(capfd):

@@ -50,7 +50,7 @@ def test_a_folder_that_another_process_makes_meanwhile_stays(tmp_path):
     folder = tmp_path / "onnx"
     folder.mkdir()
     with pytest.raises(UserError, match="onnx exists already: remove it"):
-        exporting._write(folder, {"infer1.onnx": b"graph"}, {"infer1.json": {}})
+        exporting.write_folder(folder, {"infer1.onnx": b"graph"}, {"infer1.json": {}})
     assert [path.name for path in tmp_path.iterdir()] == ["onnx"]
     assert not list(folder.iterdir())
 
