@@ -1,6 +1,7 @@
 """Files that parse and hold what no consumer can use: each reader refuses them, and names key and value."""
 
 import json
+import os
 import struct
 import sys
 from copy import deepcopy
@@ -30,6 +31,7 @@ from imfvla.reporting.results import Result
 from imfvla.reporting.runs import evaluations
 from imfvla.reporting.table_row import print_row
 from imfvla.robot import Camera
+from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
 from imfvla.sources.mcap import McapSource
 from imfvla.storage import documents
 from imfvla.storage.documents import MAX_YAML_VALUES
@@ -144,6 +146,12 @@ def test_episodes_are_what_they_should_be(run, rows, key, value, message):
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     with pytest.raises(UserError, match=message):
         read_evaluated(evaluations(run)[0])
+
+
+def test_a_pipe_is_not_taken_for_rows_that_were_left(tmp_path):
+    os.mkfifo(tmp_path / PARTIAL)
+    with pytest.raises(UserError, match="Wanted a file, found a named pipe"), RolloutLog(tmp_path, {}) as log:
+        log.begin()
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,8 @@ class RolloutLog:
         try:
             text = read_text(self._partial, ROWS)
             refuse_many_parts(text)
+        except UserError:  # a pipe or a link, which is not ours to replace
+            raise
         except ValueError:
             return ["damaged\n"]
         return text.splitlines(keepends=True)
