@@ -6,7 +6,7 @@ may have written them. Both fail on missing and ill-typed ones. Numbers, texts a
 
 import math
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache
@@ -50,6 +50,7 @@ class Limit:
 
     wanted: str
     holds: Callable[[Any], bool]
+    is_of_length: bool = False  # then it is checked before the entries, of which there may be millions
 
 
 def at_least(lowest: float) -> Limit:
@@ -82,17 +83,17 @@ def some(each: Limit) -> Limit:
 
 def at_most(entries: int) -> Limit:
     """Texts of at most so many characters, and lists and mappings of at most so many entries."""
-    return Limit(f"of length {entries} at most", lambda value: len(value) <= entries)
+    return Limit(f"of length {entries} at most", lambda value: len(value) <= entries, True)
 
 
 def within_length(fewest: int, most: int) -> Limit:
     """Lists of so many entries."""
-    return Limit(f"a list of {fewest} to {most} entries", lambda value: fewest <= len(value) <= most)
+    return Limit(f"a list of {fewest} to {most} entries", lambda value: fewest <= len(value) <= most, True)
 
 
 def of_length(entries: int) -> Limit:
     """Lists of so many entries."""
-    return Limit(f"a list of {entries} entries", lambda value: len(value) == entries)
+    return Limit(f"a list of {entries} entries", lambda value: len(value) == entries, True)
 
 
 DIFFERENT = Limit("values that all differ", lambda values: len(set(values)) == len(values))
@@ -173,6 +174,9 @@ def convert(value: Any, hint: Any, key: str, prefix: str = "") -> Any:
         return float(value) if hint is float else value
     origin = get_origin(hint)
     if origin is Annotated:
+        for limit in hint.__metadata__:
+            if limit.is_of_length and isinstance(value, Sized) and not limit.holds(value):
+                require(False, key, prefix + limit.wanted, value)
         converted = convert(value, hint.__origin__, key, prefix)
         for limit in hint.__metadata__:
             if not limit.holds(converted):
@@ -245,11 +249,18 @@ def _mapping(value: Any, key: str, hint_of: Callable[[str], Any], prefix: str = 
 def _entries(values: Any, hint: Any, key: str) -> list[Any]:
     """The converted entries of a list."""
     require(len(values) <= MAX_ENTRIES, key, f"a list of at most {MAX_ENTRIES} entries", len(values))
-    kind, limits = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
-    # Thousands of numbers of one type are checked together, without a name for each.
-    is_alike = kind in _BOUNDED and set(map(type, values)) == {kind} and all(map(_BOUNDED[kind], values))
-    if is_alike and all(all(map(limit.holds, values)) for limit in limits):
-        return list(values)
+    kinds = [kind for kind in get_args(hint) if kind is not type(None)]
+    is_optional = get_origin(hint) in (Union, types.UnionType) and len(kinds) == 1 < len(get_args(hint))
+    alone = kinds[0] if is_optional else hint
+    kind, limits = (alone.__origin__, alone.__metadata__) if get_origin(alone) is Annotated else (alone, ())
+    # Thousands of numbers are checked together, without a name for each.
+    if kind in _TOGETHER and all(
+        type(item) in _TOGETHER[kind] or (is_optional and item is None) for item in values
+    ):
+        found = [item if item is None else kind(item) for item in values if _is_bounded(item)]
+        counted = [item for item in found if item is not None] if is_optional else found
+        if len(found) == len(values) and all(all(map(limit.holds, counted)) for limit in limits):
+            return found
     return [convert(item, hint, f"{key}[{index}]") for index, item in enumerate(values)]
 
 
@@ -261,11 +272,24 @@ def _plain(value: Any, key: str, depth: int = 0) -> Any:
         return {name: _plain(item, f"{key}.{name}" if key else name, depth + 1) for name, item in items}
     if isinstance(value, list | tuple):
         require(len(value) <= MAX_ENTRIES, key, f"a list of at most {MAX_ENTRIES} entries", len(value))
+        if all(map(_is_plain_number, value)):  # thousands of them are checked without a name for each
+            return list(value)
         return [_plain(item, f"{key}[{index}]", depth + 1) for index, item in enumerate(value)]
     if value is None:
         return None
     require(type(value) in _SCALARS, key or "it", "a number, a text, true, false, a list or a mapping", value)
     return convert(value, type(value), key)
+
+
+def _is_plain_number(value: Any) -> bool:
+    return value is None or (value.__class__ in _NUMBERS and _is_bounded(value))
+
+
+def _is_bounded(value: Any) -> bool:
+    """Whether a number is finite, and one that arrays hold where it is whole."""
+    return value is None or (
+        math.isfinite(value) if value.__class__ is float else -MAX_WHOLE <= value <= MAX_WHOLE
+    )
 
 
 def _is_finite(value: Any) -> bool:
@@ -286,10 +310,8 @@ _FITS: dict[Any, Callable[[Any], bool]] = {
     str: lambda value: isinstance(value, str),
     Number: lambda value: isinstance(value, float) or _is_finite(value),
 }
-_BOUNDED: dict[Any, Callable[[Any], bool]] = {
-    float: math.isfinite,
-    int: lambda value: -MAX_WHOLE <= value <= MAX_WHOLE,
-}
+_NUMBERS = frozenset({int, float, bool})
+_TOGETHER = {int: frozenset({int}), float: frozenset({int, float})}
 _SHORT = Repr()
 _SHORT.maxlevel, _SHORT.maxdict, _SHORT.maxlist, _SHORT.maxtuple = 4, 20, 20, 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200

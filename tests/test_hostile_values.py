@@ -1,6 +1,7 @@
 """Files that parse and hold what no consumer can use: each reader refuses them, and names key and value."""
 
 import json
+import os
 import struct
 import sys
 from copy import deepcopy
@@ -30,7 +31,9 @@ from imfvla.reporting.results import Result
 from imfvla.reporting.runs import evaluations
 from imfvla.reporting.table_row import print_row
 from imfvla.robot import Camera
+from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
 from imfvla.sources.mcap import McapSource
+from imfvla.storage import documents
 from imfvla.storage.documents import MAX_YAML_VALUES
 from imfvla.storage.metrics import read_metrics
 from imfvla.storage.run_directory import RunDirectory
@@ -100,6 +103,11 @@ def folder_of(run: RunDirectory) -> Path:
         ("experiment", "a\x1b[31m", "experiment must be a text of 1 to 200 printable"),
         ("stages", ["a"] * 1000, "stages must be of length 100 at most"),
         ("nfe", 0, "nfe must be between 1"),
+        ("experiment", "../x", "experiment must be the name of a file, without a directory"),
+        ("protocol.delay_ms", 20, "has delay_ms 20 on a paused clock"),
+        ("protocol.meanwhile", "continue", "has meanwhile 'continue' on a paused clock"),
+        ("protocol.condition", "bump", "has the condition bump with severity None"),
+        ("protocol.severity", 2, "has the condition none with severity 2"),
         ("other", {"deep": [[[[]]] * 3]}, None),
     ],
 )  # fmt: skip
@@ -140,12 +148,19 @@ def test_episodes_are_what_they_should_be(run, rows, key, value, message):
         read_evaluated(evaluations(run)[0])
 
 
+def test_a_pipe_is_not_taken_for_rows_that_were_left(tmp_path):
+    os.mkfifo(tmp_path / PARTIAL)
+    with pytest.raises(UserError, match="Wanted a file, found a named pipe"), RolloutLog(tmp_path, {}) as log:
+        log.begin()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("seed: [1]", r"seed must be a whole number, found \[1\]"),
         ("seed: '1'", "seed must be a whole number, found '1'"),
         ("seed: -1", "seed must be between 0 and"),
+        ("name: ../../x", "name must be the name of a file, without a directory"),
         ("name: 5", "name must be a text"),
         ("core: {_target_: 5}", "core._target_ must be a text"),
         ("generator: imf", "generator must be a mapping"),
@@ -169,6 +184,62 @@ def test_a_config_is_what_it_should_be(run, text, message):
 def test_metrics_are_what_they_should_be(run, row):
     run.metrics.write_text(json.dumps(row) + "\n")
     with pytest.raises(UserError, match=r"metrics\.jsonl, line 1"):
+        read_metrics(run.metrics)
+
+
+LATENCY = {"median_ms": 5.0, "p95_ms": 6.0, "calls": 20, "at": "now", "load": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("latency", "message"),
+    [
+        (None, "has a measured delay, but lacks latency_alone"),
+        (LATENCY | {"nfe": 3}, "has a latency of nfe 3, but its protocol has 1"),
+        (LATENCY | {"median_ms": 0}, "latency_alone.median_ms must be above 0"),
+        (LATENCY | {"median_ms": HUGE}, "latency_alone.median_ms must be a finite number"),
+        (LATENCY | {"nfe": 1}, None),
+    ],
+)
+def test_a_measured_delay_comes_with_what_was_measured(run, latency, message):
+    path = folder_of(run) / "summary.json"
+    change_file(path, "protocol.clock", "running")
+    change_file(path, "protocol.delay_ms", "measured")
+    if latency is not None:
+        change_file(path, "latency_alone", latency)
+    if message is None:
+        print_row(run)
+        return
+    with pytest.raises(UserError, match=message):
+        print_row(run)
+
+
+def test_a_long_list_of_what_nobody_reads_is_checked_without_a_name_for_each(run):
+    path = folder_of(run) / "summary.json"
+    many = [*range(1000), None, True, 1.5]
+    change_file(path, "other", many)
+    assert evaluations(run)[0].summary["other"] == many
+    change_file(path, "other", [*many, HUGE])
+    with pytest.raises(UserError, match=r"other\[1003\] must be a whole number up to"):
+        evaluations(run)
+
+
+def test_json_of_very_many_parts_is_refused_before_it_is_parsed(run, monkeypatch):
+    monkeypatch.setattr(documents.refuse_many_parts, "__defaults__", (1000,))
+    change_file(folder_of(run) / "summary.json", "other", [[]] * 1000)
+    with pytest.raises(UserError, match="keys, lists and mappings, wanted at most 1000"):
+        evaluations(run)
+
+
+def test_metrics_of_whole_numbers_and_nothing_are_rows(run):
+    rows = [{"step": 1, "loss": 2}, {"step": 2, "loss": None, "lr": -(10**300)}]
+    run.metrics.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert read_metrics(run.metrics) == rows
+
+
+@pytest.mark.parametrize("value", [True, "1", [1.0], {}, HUGE])
+def test_one_bad_metric_of_many_is_named(run, value):
+    run.metrics.write_text('{"step": 1, "loss": 1.0}\n' + json.dumps({"step": 2, "lr": value}) + "\n")
+    with pytest.raises(UserError, match=r"metrics\.jsonl, line 2: lr must be null or a number"):
         read_metrics(run.metrics)
 
 
@@ -287,7 +358,8 @@ def test_frames_are_of_steps_that_exist(tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("actions", [[0.5] * 2000] * 2000, r"actions\[0\] must be of length 200 at most"),
+        ("actions", [[0.5] * 2000] * 2000, "actions must be of length 200 at most"),
+        ("actions", [[0.5] * 2000], r"actions\[0\] must be of length 200 at most"),
         ("actions", [[1.5]], r"actions\[0\]\[0\] must be between 0 and 1"),
         ("actions", [["1"]], r"actions\[0\]\[0\] must be a finite number"),
         ("actions", [[]], "actions must be weights of at least one sublayer"),
@@ -309,6 +381,12 @@ def test_depth_weights_are_what_they_should_be(tmp_path, key, value, message):
         ("error.hold still", ..., "error must be of hold still"),
         ("executed", 5, "error of hold still"),
         ("protocol.held_out", 3, "protocol.held_out must be a list"),
+        (
+            "error.infer0",
+            [[0.1, 0.2]],
+            "a key must be hold still, nearest demonstration or infer and a number",
+        ),
+        ("error.infer1", [[0.1] * 2000], r"error.infer1\[0\] must be of length 1000 at most"),
     ],
 )
 def test_offline_results_are_what_they_should_be(run, key, value, message):

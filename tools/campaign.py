@@ -35,7 +35,7 @@ from imfvla.errors import UserError
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped
 from imfvla.reporting.shipping import ship
-from imfvla.storage.files import put_folder
+from imfvla.storage.files import locked, put_folder
 from imfvla.storage.run_directory import RunDirectory
 
 RESULTS, LOGS = Path("experiments/results"), Path("runs/campaign")
@@ -158,9 +158,10 @@ class Campaign:
 def keep(policy: Policy) -> dict[str, object]:
     """Replaces the policy's result by that of its run directory. UserError as `ship` raises it."""
     fresh = policy.target.with_name(f".{policy.target.name}.new")
-    shutil.rmtree(fresh, ignore_errors=True)
-    made_by = ship(RunDirectory(policy.directory), fresh, with_weights=False)
-    put_folder(fresh, policy.target)
+    with locked(policy.target):  # another campaign may keep the same one
+        shutil.rmtree(fresh, ignore_errors=True)
+        made_by = ship(RunDirectory(policy.directory), fresh, with_weights=False)
+        put_folder(fresh, policy.target)
     return made_by
 
 

@@ -17,6 +17,8 @@ changes                            data, rows, numbers, config, weights and code
 leftovers                          SIGKILL within the writing of a state, always; what is left is counted
 strangers                          a link that leads out, a pipe, a socket, a device, a directory or 8 GB of zeros in
                                    place of a file of a run directory, four times as often
+folders                            SIGKILL in conversions and exports, which leave a whole folder or none; four of them
+                                   that make one folder at once
 publications                       four commands that publish into one folder at once
 reports                            reports in a loop over a run that is being trained and evaluated
 no_locks                           a file system without locks
@@ -48,6 +50,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "tests"), str(ROOT / "tests" / "training")]
 from faults.changes import changes  # noqa: E402
 from faults.disk import disk  # noqa: E402
+from faults.folders import folders  # noqa: E402
 from faults.fuse import fuse  # noqa: E402
 from faults.killing import kills_of  # noqa: E402
 from faults.leftovers import leftovers  # noqa: E402
@@ -75,6 +78,7 @@ FAULTS: dict[str, Callable[[Path, int, random.Random], str]] = {
     "changes": changes,
     "leftovers": leftovers,
     "strangers": strangers,
+    "folders": folders,
     "publications": publications,
     "no_locks": no_locks,
     "reports": reports,

@@ -63,6 +63,7 @@ def main() -> int:
     torch.set_num_threads(1)
     directory = RunDirectory(arguments.run)
     config, checkpoint = directory.config(), arguments.checkpoint
+    settings = settings_of(config)
     step = directory.weights_step(int(checkpoint) if checkpoint.isdecimal() else checkpoint)
     policy = load_policy(directory, step).to(arguments.device)
     for nfe in arguments.nfe:
@@ -73,7 +74,6 @@ def main() -> int:
         paths = record_starts(config, arguments.out, first_seed, episodes)
     else:
         paths = choose_recordings(config, arguments.demos, first_seed, episodes)
-    settings = settings_of(config)
     grippers = grippers_of(policy.robot)
     stops = Stops(policy.horizon, settings.views, grippers, len(paths), arguments.observations)
     for path in paths:

@@ -14,6 +14,11 @@ from omegaconf.errors import OmegaConfBaseException
 from imfvla.command import composition
 from imfvla.errors import UserError, as_user_error
 
+RERUN = (
+    "Rerun the same command once no job of it runs any more: finished jobs are skipped, and others resume."
+)
+LOST = "UncompletedJobError"  # submitit's, which need not be installed
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
@@ -30,7 +35,17 @@ class Failure:
         known = as_user_error(error)
         if known is not None:
             return cls(overrides, str(known), True)
+        if is_lost(error):
+            what = " ".join(str(error).splitlines()[:2])
+            return cls(
+                overrides, f"A job ended without a result, as one does that is killed ({what}). {RERUN}", True
+            )
         return cls(overrides, "".join(traceback.format_exception(error)).rstrip("\n"), False)
+
+
+def is_lost(error: Exception) -> bool:
+    """Whether a launcher says that a process ended without a result."""
+    return type(error).__name__ == LOST
 
 
 class HydraJob:

@@ -14,10 +14,11 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
 
-from imfvla.command.jobs import Failure, HydraJob
+from imfvla.command.jobs import Failure, HydraJob, is_lost
 from imfvla.command.planning import Planned, composed, path_of, plan
 from imfvla.process.progress import Progress
 
+STILL_RUNNING = "Not finished yet; it may still be running."
 LOOK_EVERY_S = 5.0  # seconds between looks at what jobs in other processes have finished
 IsFinished = Callable[[dict[str, Any], Path], bool]
 log = logging.getLogger(__name__)
@@ -118,7 +119,9 @@ class _Sweep:
         except Exception as error:
             left = [" ".join(job.overrides) for job in batch if not self._has_finished(job)]
             first = [Failure.of(error, self._config_name, overrides) for overrides in left[:1]]
-            return first + [Failure(other, "Not finished, for the same reason.", False) for other in left[1:]]
+            # Of a launcher that starts all jobs at once the others may still be running.
+            lost, text = is_lost(error), "Not finished, for the same reason."
+            return first + [Failure(other, STILL_RUNNING if lost else text, lost) for other in left[1:]]
 
     @contextmanager
     def _counted(self, batch: Sequence[Planned], bar: Progress) -> Iterator[None]:

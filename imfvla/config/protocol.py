@@ -24,7 +24,7 @@ DEMONSTRATION_SEEDS = range(SELECTION_FIRST_SEED), range(1_000_000, 10_000_000)
 REPORTING_SEEDS = range(REPORTING_FIRST_SEED, DEMONSTRATION_SEEDS[1].start)
 LAST = "last"  # of the weights that are kept
 MAX_SEED = 2**32 - 1  # the highest that numpy's generators and MuJoCo's start states accept
-MAX_EPISODES = 1_000_000
+MAX_EPISODES = 50_000  # of an evaluation: more could not be read back, see `storage.documents.MAX_PARTS`
 MAX_WORKERS = 1024
 MAX_TIMEOUT_S = 7 * 24 * 3600
 

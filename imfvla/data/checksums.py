@@ -56,6 +56,8 @@ def checked_sums(folder: Path, meta: Mapping[str, Any], names: Sequence[str]) ->
         return sums
     if KEY in meta and meta[KEY][META] != _sum_of({key: meta[key] for key in meta if key != KEY}):
         raise ValueError(f"{META} is not as it was written")
+    if KEY in meta:
+        _compare_lengths(folder, meta[KEY], names)  # before terabytes are read
     sums = {name: block_sums(folder / name) for name in names}
     if KEY in meta:
         _compare(sums, meta[KEY], names)
@@ -80,17 +82,21 @@ def digest_of(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _compare(found: Sums, written: Mapping[str, Any], names: Sequence[str]) -> None:
+def _compare_lengths(folder: Path, written: Mapping[str, Any], names: Sequence[str]) -> None:
     if written["block_bytes"] != BLOCK_BYTES:
         raise ValueError(f"its checksums are of {written['block_bytes']} bytes, wanted {BLOCK_BYTES}")
+    for name in names:
+        if -(-(folder / name).stat().st_size // BLOCK_BYTES) != len(written[name]):
+            raise ValueError(f"{name} has another length than when it was written")
+
+
+def _compare(found: Sums, written: Mapping[str, Any], names: Sequence[str]) -> None:
     faults = [_difference(name, found[name], written[name]) for name in names if found[name] != written[name]]
     if faults:
         raise ValueError("; ".join(faults))
 
 
 def _difference(name: str, found: Sequence[str], written: Sequence[str]) -> str:
-    if len(found) != len(written):
-        return f"{name} has another length than when it was written"
     places = [number for number, pair in enumerate(zip(found, written, strict=True), 1) if pair[0] != pair[1]]
     named = ", ".join(map(str, places[:MOST_NAMED])) + f" and {len(places) - MOST_NAMED} more" * (
         len(places) > MOST_NAMED

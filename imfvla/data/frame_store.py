@@ -61,13 +61,18 @@ class FrameStore:
             meta = read_record(path / "meta.json", StoreMeta, "delete the store")
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
-            sums = checked_sums(path, meta, ARRAYS)
-            content = {name: digest_of(sums[name]) for name in ARRAYS}
-            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
             images = _mapped(path / IMAGES, np.uint8, shape)
+            rows, frames = (
+                sum(entry[key] for entry in meta["episodes"]) for key in ("num_steps", "num_frames")
+            )
+            if not len(state) == len(action) == rows or len(image_steps) != frames:
+                raise ValueError("its arrays differ in length")
+            sums = checked_sums(path, meta, ARRAYS)  # of whole files, which are as long as they should be
+            content = {name: digest_of(sums[name]) for name in ARRAYS}
+            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             episodes, row, frame = [], 0, 0
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
@@ -76,8 +81,6 @@ class FrameStore:
                 entry["instructions"] = known.setdefault(instructions, instructions)
                 episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
                 row, frame = row + entry["num_steps"], frame + len(steps)
-            if not len(state) == len(action) == row or len(image_steps) != frame:
-                raise ValueError("its arrays differ in length")
             _check_arrays(state, action, image_steps, episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(

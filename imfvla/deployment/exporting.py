@@ -13,13 +13,21 @@ from imfvla.deployment.parity import TOLERANCE, largest_difference, latencies, o
 from imfvla.policy import Policy
 from imfvla.process.progress import Progress
 from imfvla.reporting.table import Table, number
-from imfvla.storage.files import clear_write_errors, locked, make_folder, put_folder, write_json
+from imfvla.storage.files import (
+    clear_write_errors,
+    locked,
+    make_folder,
+    put_folder,
+    refuse_existing,
+    write_json,
+)
 from imfvla.storage.fingerprint import fingerprint
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.trained_config import digest_of_config
 from imfvla.training.checkpoint import load_policy
 
 FORMAT = "imfvla-onnx-1"
+EXISTING = "remove it, or name another folder with output=DIR"
 INPUTS = {
     "images": "uint8, one picture of each of `views` at each observed step",
     "state": "float32, the state channels of `robot`, in its units",
@@ -78,7 +86,7 @@ def export_policy(
                 )
             )
             bar.advance()
-    _write(folder, files, cards)
+    write_folder(folder, files, cards)
     columns = ("nfe", "Eager [ms]", "ONNX Runtime [ms]", "Ratio", "Largest difference")
     note = (
         f"One thread, medians of {calls} predictions in turn. Differences over {len(observed)} observations."
@@ -107,11 +115,16 @@ def _interface(policy: Policy) -> dict[str, Any]:
     }
 
 
-def _write(folder: Path, files: dict[str, bytes], cards: dict[str, dict[str, Any]]) -> None:
+def write_folder(folder: Path, files: dict[str, bytes], cards: dict[str, dict[str, Any]]) -> None:
+    """Makes `folder` of graphs and cards, whole or not at all.
+
+    Raises UserError where it exists, or cannot be written.
+    """
     part = folder.with_name(f".{folder.name}.part")
     with clear_write_errors(folder):
         make_folder(folder.parent)
         with locked(folder):
+            refuse_existing(folder, EXISTING)  # another process may have made it meanwhile
             shutil.rmtree(part, ignore_errors=True)
             try:
                 part.mkdir()

@@ -1,5 +1,6 @@
 """How much the sublayers of trained policies read from earlier ones: heat maps of mean Attention Residual weights."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from imfvla.figures.description import TWO_SUBLAYERS, sublayers_of
 from imfvla.figures.style import GREY, INK, WIDTH, new_figure, style
 from imfvla.options import at_most, require, within
-from imfvla.storage.records import Name, Step, read_record
+from imfvla.storage.records import FileName, Step, read_record
 
 FILE = "depth_attention.json"  # in a run directory, from tools/depth_attention.py
 COLUMNS = 2
@@ -29,7 +30,7 @@ Weights = Annotated[
 class DepthWeights(TypedDict):
     """What is recorded of a policy: for each sublayer that reads, the weights of those before it."""
 
-    experiment: Name
+    experiment: FileName
     checkpoint_step: Step
     actions: Weights
     context: Weights
@@ -43,7 +44,7 @@ def read_depth_attention(run: Path, core: Mapping[str, Any] | None = None) -> di
     path = run / FILE
     if not path.exists():
         return None
-    remedy = f"delete it or repeat python tools/depth_attention.py {run}"
+    remedy = f"delete it or repeat python tools/depth_attention.py {shlex.quote(str(run))}"
     found = read_record(path, DepthWeights, remedy)
     require(any(found["actions"]), f"{path}: actions", "weights of at least one sublayer", "none")
     return found | {"sublayers": sublayers_of(core) if core else TWO_SUBLAYERS}

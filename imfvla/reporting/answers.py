@@ -1,5 +1,6 @@
 """Which evaluations answer the rows of the tables, and what to run where none does."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -197,7 +198,7 @@ def _has_weights(run: Path, config: dict[str, Any], row: TableRow) -> bool:
 
 def _evaluate(row: TableRow, run: Path) -> str:
     wanted = row.wanted
-    parts = [f"python -m imfvla.evaluate run={run} nfe={row.nfe}"]
+    parts = [f"python -m imfvla.evaluate {shlex.quote(f'run={run}')} nfe={row.nfe}"]
     if row.checkpoint != LAST:
         parts.append(f"checkpoint={row.checkpoint}")
     parts.append(f"first_seed={wanted.first_seed} episodes={wanted.episodes}")

@@ -1,12 +1,14 @@
 """The numbers of an evaluation come from episodes.jsonl; those in summary.json are a copy that nothing relies on."""
 
 import hashlib
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from math import isclose
 from pathlib import Path
 from typing import Any
 
+from imfvla.config.protocol import MEASURED, PAUSED, USUAL
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import REMEDY, episode_lines, parse_episodes
 from imfvla.reporting.metrics import summarise
@@ -14,7 +16,14 @@ from imfvla.reporting.records import Row
 
 EPISODES = "episodes.jsonl"
 DIGEST = "episodes_digest"  # key of summary.json; evaluations from before it have none
+DESCRIPTION = "description_digest"  # key of summary.json; evaluations from before it have none
+DESCRIBED = (
+    *("name", "experiment", "nfe", "checkpoint_step", "stages", "seeds", "protocol", "latency_alone"),
+    "fingerprint",
+)
 RECORDINGS = "recordings"  # key of summary.json, with the returns of the episodes that were recorded
+OF_LATENCY = ("weights", "nfe", "candidates", "device")
+OF_RUNNING = ("delay_ms", "delay_steps", "meanwhile")  # keys of a protocol
 OF_SOME_TASKS = ("success_of_goal",)  # metrics that not every evaluation has
 log = logging.getLogger(__name__)
 
@@ -62,6 +71,12 @@ def digest_of(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
 
 
+def description_digest(summary: Mapping[str, Any]) -> str:
+    """16 hex digits of all in a summary that its episodes do not say, as its file has it."""
+    said = {key: summary[key] for key in DESCRIBED if key in summary}
+    return digest_of(json.dumps(said, sort_keys=True))
+
+
 def _with_returns(folder: Path, recordings: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
     """The recorded episodes with the returns of their rows. Raises UserError where one has no row."""
     returns = {row["seed"]: row["total_reward"] for row in rows}
@@ -87,6 +102,25 @@ def _refuse_contradictions(folder: Path, summary: Mapping[str, Any]) -> None:
                 f"{folder}/summary.json states {key} {value!r}, but its protocol has {protocol[key]!r}: one was "
                 f"changed; {REMEDY}."
             )
+    if latency := summary.get("latency_alone"):
+        for key in (key for key in OF_LATENCY if key in latency and latency[key] != protocol.get(key)):
+            raise UserError(
+                f"{folder}/summary.json has a latency of {key} {latency[key]!r}, but its protocol has "
+                f"{protocol.get(key)!r}: one was changed; {REMEDY}."
+            )
+    elif protocol.get("delay_ms") == MEASURED:
+        raise UserError(f"{folder}/summary.json has a measured delay, but lacks latency_alone: {REMEDY}.")
+    paused = protocol.get("clock", PAUSED) == PAUSED
+    if needless := [key for key in OF_RUNNING if paused and protocol.get(key, USUAL[key]) != USUAL[key]]:
+        raise UserError(
+            f"{folder}/summary.json has {needless[0]} {protocol[needless[0]]!r} on a paused clock: one was changed; "
+            f"{REMEDY}."
+        )
+    condition, severity = (protocol.get(key, USUAL[key]) for key in ("condition", "severity"))
+    if (condition == USUAL["condition"]) != (severity is None):
+        raise UserError(
+            f"{folder}/summary.json has the condition {condition} with severity {severity}: one was changed; {REMEDY}."
+        )
 
 
 def _equal(told: Any, value: Any) -> bool:

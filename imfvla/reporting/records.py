@@ -91,7 +91,8 @@ class Latency(TypedDict):
     load: Duration  # mean number of waiting processes in the minute before
 
 
-Latencies = Annotated[list[Latency], at_most(1000)]  # latency.json
+MOST_LATENCIES = 1000
+Latencies = Annotated[list[Latency], at_most(MOST_LATENCIES)]  # latency.json
 
 
 class Summary(TypedDict):
@@ -114,7 +115,7 @@ class Summary(TypedDict):
     success_of_goal: NotRequired[Mapping[str, Annotated[list[Count], of_length(2)]]]
     failures: NotRequired[Annotated[Mapping[str, Count], at_most(1000)]]
     name: FileName
-    experiment: Name
+    experiment: FileName
     nfe: Nfe
     checkpoint_step: Step
     stages: NotRequired[Annotated[list[Label], at_most(MOST_STAGES)]]

@@ -1,6 +1,7 @@
 """Reads run directories: the evaluations of a run, one for each NFE."""
 
 import os
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.recomputed import recomputed
+from imfvla.reporting.recomputed import DESCRIPTION, description_digest, recomputed
 from imfvla.reporting.records import Row, Summary
 from imfvla.storage.documents import read_json
 from imfvla.storage.opening import walk
@@ -134,7 +135,8 @@ def rows(run: RunDirectory) -> list[Evaluation]:
     found = evaluations(run)
     if not found:
         raise UserError(
-            f"{run.path} has no finished evaluation: make one with python -m imfvla.evaluate run={run.path}."
+            f"{run.path} has no finished evaluation: make one with python -m imfvla.evaluate "
+            f"{shlex.quote(f'run={run.path}')}."
         )
     chosen: dict[int, Evaluation] = {}
     for evaluation in sorted(found, key=_rank):
@@ -190,6 +192,11 @@ def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation
 def read_summary(path: Path, home: Path | None = None) -> Summary:
     """What a summary in the run `home` says, its protocol completed. Raises UserError for anything else."""
     found = read_json(path, REMEDY, mapping=True, home=home)
+    stated = found.get(DESCRIPTION)
+    if stated is not None and stated != description_digest(found):
+        raise UserError(
+            f"{path} was changed after it was written: it is not what its {DESCRIPTION} was made of; {REMEDY}."
+        )
     found.setdefault("name", path.parent.name)
     if isinstance(protocol := found.get("protocol"), dict):
         found |= {"protocol": as_recorded(protocol)}

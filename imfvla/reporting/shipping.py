@@ -12,11 +12,21 @@ from imfvla.errors import UserError
 from imfvla.options import part_of
 from imfvla.reporting.runs import evaluations
 from imfvla.storage.documents import read_lines
-from imfvla.storage.files import clear_write_errors, copy_file, locked, put_folder, write_json, write_text
+from imfvla.storage.files import (
+    clear_write_errors,
+    copy_file,
+    locked,
+    put_folder,
+    refuse_existing,
+    write_json,
+    write_text,
+)
+from imfvla.storage.metrics import MOST_PARTS
 from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import DONE, LAST, RunDirectory, flatten
 
 MAX_BYTES = 16_000_000  # of the weights
+EXISTING = "remove it first"
 THINNING = 10
 TRAIN = ("python", "-m", "imfvla.train")
 RECORDED = ("depth_attention.json",)  # what tools may have added to a run
@@ -29,7 +39,7 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
     weights above 16 MB, no reported evaluation, or a target that exists.
     """
-    refuse_existing(target)
+    refuse_existing(target, EXISTING)
     state = run.status().get("state")
     if state != DONE:
         raise UserError(f"{run.path} is not a finished run: its state is {state}, wanted {DONE}.")
@@ -47,10 +57,10 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     copied = [run.path / "config.yaml", run.path / "status.json", *recorded]
     copied += [weights.with_suffix(".json"), weights] if with_weights else []
     copied += [one.folder / name for one in reported for name in ("episodes.jsonl", "summary.json")]
-    rows = read_lines(run.metrics, "restore it or train again")
+    rows = read_lines(run.metrics, "restore it or train again", most_parts=MOST_PARTS)
     part = target.with_name(f".{target.name}.part")
     with locked(target):
-        refuse_existing(target)
+        refuse_existing(target, EXISTING)
         shutil.rmtree(part, ignore_errors=True)
         try:
             for source in copied:
@@ -62,12 +72,6 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
         finally:
             shutil.rmtree(part, ignore_errors=True)
     return made_by
-
-
-def refuse_existing(target: Path) -> None:
-    """Raises UserError where there is something already."""
-    if target.exists():
-        raise UserError(f"{target} exists already: remove it first.")
 
 
 def command_of(run: RunDirectory, config: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import CONTINUE, HOLD
+from imfvla.config.protocol import CONTINUE, HOLD, MOST_DELAY_MS
 from imfvla.errors import UserError
 
 FIRST = 0  # step of the first decision, whose chunk is waited for
@@ -78,8 +78,13 @@ def longest_delay(horizon: Horizon) -> int:
 def delay_steps(delay_ms: float, control_hz: float, horizon: Horizon, meanwhile: str) -> int:
     """A delay in control steps, rounded up: a chunk that is late by a moment waits for the next step.
 
-    Raises UserError where the horizon cannot bear it.
+    Raises UserError where the horizon cannot bear it, and beyond what an option may say, as a measured one can be.
     """
+    if delay_ms > MOST_DELAY_MS:
+        raise UserError(
+            f"delay_ms={delay_ms:g} is above {MOST_DELAY_MS}: evaluate with clock=paused, or with a number. A measured "
+            "one is kept in latency.json of the run."
+        )
     steps = math.ceil(delay_ms * control_hz / 1000 - 1e-9)
     found = (
         f"delay_ms={delay_ms:g} is {steps} control {'step' if steps == 1 else 'steps'} at {control_hz:g} Hz"

@@ -13,7 +13,7 @@ import numpy as np
 
 from imfvla.config.protocol import Protocol
 from imfvla.environment import Environment
-from imfvla.reporting.records import Latencies, Latency
+from imfvla.reporting.records import MOST_LATENCIES, Latencies, Latency
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.storage.files import write_json
 from imfvla.storage.fingerprint import machine
@@ -47,7 +47,7 @@ def latency_of(
     if len(others) < len(kept) and not again:
         return next(found for found in kept if found not in others)
     found = {**of, **measure()}
-    write_json(path, [*others, found])
+    write_json(path, [*others, found][-MOST_LATENCIES:])
     return found
 
 

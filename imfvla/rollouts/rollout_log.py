@@ -11,12 +11,12 @@ from typing import Any
 
 from imfvla.errors import UserError
 from imfvla.reporting.episodes import check_goals, read_row
+from imfvla.reporting.recomputed import DESCRIPTION, EPISODES, description_digest, digest_of, recomputed
 from imfvla.reporting.recomputed import DIGEST as EPISODES_DIGEST
-from imfvla.reporting.recomputed import EPISODES, digest_of, recomputed
 from imfvla.reporting.records import Row
 from imfvla.reporting.runs import read_summary
 from imfvla.storage.appended import AppendedFile
-from imfvla.storage.documents import parse_json, read_text
+from imfvla.storage.documents import parse_json, read_text, refuse_many_parts
 from imfvla.storage.files import (
     clear_write_errors,
     delete_leftovers,
@@ -95,6 +95,7 @@ class RolloutLog:
         text = "".join(dump_row(row) for row in rows)
         write_text(self.path / EPISODES, text)
         summary = {**summary, DIGEST: self._config_digest, EPISODES_DIGEST: digest_of(text)}
+        summary[DESCRIPTION] = description_digest(summary)
         write_json(summary_path, summary)
         self._stream.close()
         self._stream = None
@@ -149,9 +150,13 @@ class RolloutLog:
     def _left(self) -> list[str]:
         """The lines of an interrupted evaluation."""
         try:
-            return read_text(self._partial, ROWS).splitlines(keepends=True)
-        except UnicodeDecodeError:
+            text = read_text(self._partial, ROWS)
+            refuse_many_parts(text)
+        except UserError:  # a pipe or a link, which is not ours to replace
+            raise
+        except ValueError:
             return ["damaged\n"]
+        return text.splitlines(keepends=True)
 
 
 def dump_row(row: Row) -> str:

@@ -1,14 +1,14 @@
 """A folder that is whole or absent: filled beside its place, then renamed."""
 
-import os
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
-from imfvla.errors import UserError
-from imfvla.storage.files import clear_write_errors, locked, make_folder, put_folder
+from imfvla.storage.files import clear_write_errors, locked, make_folder, put_folder, refuse_existing
+
+EXISTING = "choose another path, for a new folder"
 
 
 class NewFolder:
@@ -21,12 +21,12 @@ class NewFolder:
     def __init__(self, path: Path, close: Callable[[], None], abort: Callable[[], None]) -> None:
         self.path, self._close, self._abort = path, close, abort
         self.part = path.with_name(f".{path.name}.part")
-        self._refuse_existing()
+        refuse_existing(path, EXISTING)
 
     def __enter__(self) -> Path:
         with ExitStack() as held:
             held.enter_context(locked(self.path))
-            self._refuse_existing()  # another process may have made it meanwhile
+            refuse_existing(self.path, EXISTING)  # another process may have made it meanwhile
             with clear_write_errors(self.path):
                 shutil.rmtree(self.part, ignore_errors=True)  # of a killed process
                 make_folder(self.path.parent)
@@ -48,10 +48,6 @@ class NewFolder:
                 raise
             if error is not None:
                 self._remove()
-
-    def _refuse_existing(self) -> None:
-        if os.path.lexists(self.path):
-            raise UserError(f"{self.path} exists already, wanted a new folder: choose another path.")
 
     def _remove(self) -> None:
         self._abort()

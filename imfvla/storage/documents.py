@@ -12,6 +12,8 @@ from imfvla.errors import UserError, unreadable
 from imfvla.storage.opening import JSON, ROWS, YAML, Kind, open_to_read
 
 MAX_LINES = 1_000_000  # of JSON
+# Keys, lists and mappings of JSON: one takes some microseconds to check, a number in a long list far less.
+MAX_PARTS = 1_000_000
 MAX_YAML_DEPTH = 64
 MAX_YAML_VALUES = 20_000  # keys, values, lists and mappings; each takes some 0.1 ms
 
@@ -80,15 +82,25 @@ def read_text(path: Path, kind: Kind, *, home: Path | None = None) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The value. Raises ValueError, also where it is nested too deeply."""
+    """The value. Raises ValueError, also where it is nested too deeply or has too many parts."""
+    refuse_many_parts(text)
     try:
         return json.loads(text)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 
 
-def read_lines(path: Path, remedy: str, *, home: Path | None = None) -> list[str]:
-    """The lines of a text in `home`, ends kept.
+def refuse_many_parts(text: str | bytes, most: int = MAX_PARTS) -> None:
+    """Raises ValueError where JSON has more keys, lists and mappings."""
+    marks = (b"[", b"{", b":") if isinstance(text, bytes) else ("[", "{", ":")
+    if (found := sum(map(text.count, marks))) > most:
+        raise ValueError(f"it has {found} keys, lists and mappings, wanted at most {most}")
+
+
+def read_lines(
+    path: Path, remedy: str, *, home: Path | None = None, most_parts: int = MAX_PARTS
+) -> list[str]:
+    """The lines of a text in `home`, ends kept; all JSON in them has at most so many parts.
 
     Raises UserError, ending with `remedy`, where it cannot be read, and where `storage.opening` refuses it.
     """
@@ -96,6 +108,7 @@ def read_lines(path: Path, remedy: str, *, home: Path | None = None) -> list[str
         text = read_text(path, ROWS, home=home)
         if (found := text.count("\n")) > MAX_LINES:
             raise ValueError(f"it has {found} lines, wanted at most {MAX_LINES}")
+        refuse_many_parts(text, most_parts)
         return text.splitlines(keepends=True)
     except UserError:
         raise

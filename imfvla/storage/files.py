@@ -107,6 +107,12 @@ def copy_file(source: Path, path: Path, *, home: Path | None = None) -> None:
             write_atomically(path, write)
 
 
+def refuse_existing(path: Path, remedy: str) -> None:
+    """Raises UserError where something has that name, a link that leads nowhere included."""
+    if os.path.lexists(path):
+        raise UserError(f"{path} exists already: {remedy}.")
+
+
 def put_file(temporary: Path, path: Path) -> None:
     """`temporary`, a file in the same folder, takes the place of `path`; both are on disk then. Raises OSError."""
     sync(temporary)

@@ -16,6 +16,7 @@ from imfvla.storage.documents import read_json
 LARGEST = 1e12  # of a reward or a time: their sums and squares are finite
 MAX_NAME = 200  # characters
 MAX_STEPS = 10**9  # of a training
+MOST_METRICS = 1000  # of a step
 NAME = Limit(
     f"a text of 1 to {MAX_NAME} printable characters",
     lambda text: 0 < len(text) <= MAX_NAME and text.isprintable(),
@@ -50,7 +51,7 @@ class Task(TypedDict, total=False):
 class RunConfig(TypedDict, total=False):
     """`config.yaml`: the keys that are read without building what they configure."""
 
-    name: Name
+    name: FileName  # of folders and figures
     seed: Seed
     task: Task
     training: Mapping[str, Plain]
@@ -109,7 +110,7 @@ class MetricsRow(TypedDict):
     loss: NotRequired[Number | None]
 
 
-Metrics = Annotated[Mapping[str, Number | None], at_most(1000)]
+Metrics = Annotated[Mapping[str, Number | None], at_most(MOST_METRICS)]
 
 
 def as_record(value: Any, hint: Any, where: str, remedy: str) -> Any:

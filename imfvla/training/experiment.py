@@ -10,7 +10,7 @@ from imfvla.config.views import ViewOptions
 from imfvla.data import Augmentation
 from imfvla.options import build, one_of, part_of, within
 from imfvla.policy.chunks import FRAMES
-from imfvla.storage.records import Name
+from imfvla.storage.records import FileName
 from imfvla.training.options import OptimOptions, TrainingOptions
 
 
@@ -18,7 +18,7 @@ from imfvla.training.options import OptimOptions, TrainingOptions
 class ExperimentOptions:
     """The keys of train.yaml, without those that say what is built: task, demos, encoder, core and generator."""
 
-    name: Name
+    name: FileName  # of its run directory
     seed: Annotated[int, within(0, MAX_SEED)]
     action_frame: Annotated[str, one_of(*FRAMES)]
     horizon: Horizon

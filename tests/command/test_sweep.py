@@ -166,6 +166,25 @@ def test_a_launcher_that_fails_is_reported_once_and_what_has_finished_counts(tmp
     assert failures[1].text == "Not finished, for the same reason."
 
 
+class UncompletedJobError(Exception):
+    """As submitit calls it."""
+
+
+def test_a_job_that_was_killed_elsewhere_is_told_in_a_sentence(tmp_path):
+    launcher = mock.Mock()
+    planned = [Planned((name,), {}, tmp_path / name) for name in ("a", "b")]
+    launcher.launch.side_effect = UncompletedJobError(
+        "Job 7 has not\nproduced any output\nError stream: 1000 lines"
+    )
+    one, other = _Sweep(launcher, False, "train", lambda config, directory: False).run(planned)
+    assert one.text.startswith(
+        "A job ended without a result, as one does that is killed (Job 7 has not produced any output). Rerun"
+    )
+    assert other.text == "Not finished yet; it may still be running."
+    assert one.is_user_error
+    assert other.is_user_error
+
+
 def test_an_unknown_launcher_is_reported_with_where_it_comes_from(capfd):
     with pytest.raises(SystemExit):
         tiny_sweep.main(["-m", "seed=0,1", "hydra/launcher=submitit_slrm"])

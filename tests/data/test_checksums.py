@@ -95,6 +95,14 @@ def test_the_blocks_that_differ_are_named(store, tmp_path, monkeypatch):
         FrameStore.open(small.path)
 
 
+@pytest.mark.parametrize("name", ["images.raw", "state.npy", "image_steps.npy"])
+def test_a_file_of_terabytes_is_refused_before_it_is_read(store, monkeypatch, name):
+    os.truncate(store.path / name, 2**40)
+    monkeypatch.setattr(checksums, "block_sums", lambda path: pytest.fail(f"{path} was read"))
+    with pytest.raises(UserError, match=rf"{name} has {2**40} bytes, wanted"):
+        FrameStore.open(store.path)
+
+
 def test_a_damaged_store_is_refused_where_it_would_be_used_again(store, synthetic_demonstrations):
     change(store, "images.raw")
     with pytest.raises(UserError, match=r"images\.raw is not as it was written"):

@@ -6,6 +6,7 @@ import pytest
 from untrained_run import untrained_run
 
 from imfvla.deployment import exporting, parity
+from imfvla.errors import UserError
 from imfvla.export import main
 
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -43,6 +44,15 @@ def test_a_graph_that_differs_is_not_written(tmp_path, capsys, monkeypatch):
         f"run={run.path}", "nfe=1", "observations=2", capsys=capsys
     )
     assert not (run.path / "onnx").exists()
+
+
+def test_a_folder_that_another_process_makes_meanwhile_stays(tmp_path):
+    folder = tmp_path / "onnx"
+    folder.mkdir()
+    with pytest.raises(UserError, match="onnx exists already: remove it"):
+        exporting.write_folder(folder, {"infer1.onnx": b"graph"}, {"infer1.json": {}})
+    assert [path.name for path in tmp_path.iterdir()] == ["onnx"]
+    assert not list(folder.iterdir())
 
 
 @pytest.mark.parametrize(

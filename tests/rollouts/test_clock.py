@@ -150,6 +150,8 @@ def test_a_delay_that_no_chunk_covers_is_refused_with_the_longest_one():
     horizon = Horizon(1, 32, 16)
     assert delay_steps(320, 50, horizon, CONTINUE) == 16
     assert delay_steps(340, 50, horizon, HOLD) == 17
+    with pytest.raises(UserError, match=r"delay_ms=1e\+12 is above 10000: .* latency.json"):
+        delay_steps(1e12, 50, horizon, HOLD)
     with pytest.raises(
         UserError, match=r"delay_ms=340 is 17 control steps at 50 Hz.* at most 16 are possible \(320 ms\)"
     ):

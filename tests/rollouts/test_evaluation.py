@@ -4,6 +4,7 @@ import json
 import os
 import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import yaml
 from fakes import FakeEnvironment, KnownPolicy, build_fakes
 
 from imfvla.config.condition import ConditionOptions
-from imfvla.config.protocol import USUAL, EvaluationOptions
+from imfvla.config.protocol import USUAL, EvaluationOptions, Protocol
 from imfvla.errors import UserError
 from imfvla.evaluate import main, read_nfe
 from imfvla.reporting.rows import TIMING
@@ -19,6 +20,7 @@ from imfvla.reporting.runs import evaluations, rows
 from imfvla.reporting.table_row import table_of
 from imfvla.rollouts import workbench
 from imfvla.rollouts.evaluation import best_median_worst, evaluate
+from imfvla.rollouts.latency import latency_of
 from imfvla.rollouts.rollout_log import PARTIAL
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.checkpoint import load_policy
@@ -168,7 +170,7 @@ def test_a_wrong_nfe_is_named(value):
         ([], "evaluate needs the directory of a training run: run="),
         (["run={tmp}/nothing"], "is not a run directory: it has no config.yaml"),
         (["run={run}", "nfe=1,0"], "nfe must be one or more whole numbers"),
-        (["run={run}", "episodes=0"], "episodes must be between 1 and 1000000, found 0"),
+        (["run={run}", "episodes=0"], "episodes must be between 1 and 50000, found 0"),
         (["run={run}", "episodes=many"], "episodes must be a whole number, found 'many'"),
         (["run={run}", "device=gpu"], "device must be one of cpu, cuda, found 'gpu'"),
         (["run={run}", "checkpoint=15"], "has no weights of step 15: kept are 10, 20, or take last"),
@@ -403,6 +405,15 @@ def test_a_measured_delay_is_taken_once_and_alone(run, monkeypatch):
         "takes 30.0 ms (p95 31.0) alone"
         in table_of([found for found in evaluations(run) if found.folder.name == again["name"]]).notes[0]
     )
+
+
+def test_a_full_latency_file_keeps_the_newest(run, monkeypatch):
+    monkeypatch.setattr("imfvla.rollouts.latency.MOST_LATENCIES", 2)
+    protocol = Protocol("fake", "default", 3, "0" * 16, 1, 0, 1.0, 0, 1, None, "cpu")
+    taken = {"median_ms": 30.0, "p95_ms": 31.0, "calls": 20, "at": "2026-11-28", "load": 0.5}
+    for nfe in (1, 2, 3):
+        latency_of(run, replace(protocol, nfe=nfe), lambda: taken)
+    assert [kept["nfe"] for kept in json.loads((run.path / "latency.json").read_text())] == [2, 3]
 
 
 def test_a_damaged_latency_is_named(run):

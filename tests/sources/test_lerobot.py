@@ -271,6 +271,15 @@ def test_a_link_out_of_the_folder_is_refused_and_one_into_the_hubs_cache_is_read
     assert len(opened(snapshot).episode(0).state) == 8
 
 
+@pytest.mark.parametrize("name", [DATA, "meta/info.json", "."])
+def test_a_link_that_leads_to_itself_is_refused(copied, name):
+    path = copied / name
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    path.symlink_to(path)
+    with pytest.raises(UserError, match=r"leads to itself|No LeRobot data set"):
+        opened(copied).episode(0, ())
+
+
 def test_lists_that_would_fill_the_memory_are_refused_before_they_are_unpacked(copied, monkeypatch):
     monkeypatch.setattr("imfvla.sources.lerobot.tables.MAX_GROUP_VALUES", 1000)
     edit_table(copied / DATA, lambda columns: columns["action"].__setitem__(0, [0.0] * 2000))

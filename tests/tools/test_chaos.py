@@ -45,6 +45,10 @@ def test_strangers_collisions_and_leftovers_do_no_harm():
     assert printed.count("none failed, none were mixed") == 2
 
 
+def test_a_killed_conversion_or_export_leaves_a_whole_folder_or_none():
+    assert "4 at once made one folder each time" in chaos("folders")
+
+
 def test_the_harness_tells_a_difference(tmp_path, capsys):
     path = list(sys.path)
     try:

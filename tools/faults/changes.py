@@ -198,6 +198,21 @@ def false_rows(run: Path, rng: random.Random) -> str:
     return "episodes.jsonl"
 
 
+def false_description(run: Path, rng: random.Random) -> str:
+    """A condition that was not played, another clock, another machine."""
+    path = next(run.glob("rollouts/*/summary.json"))
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    changed = rng.choice(
+        [
+            {"protocol": summary["protocol"] | {"condition": "bump", "severity": 1}},
+            {"protocol": summary["protocol"] | {"clock": "running", "delay_ms": 20}},
+            {"fingerprint": summary["fingerprint"] | {"machine": {"cpu": "a faster one"}}},
+        ]
+    )
+    path.write_text(json.dumps(summary | changed), encoding="utf-8")
+    return "was changed after it was written"
+
+
 def no_rows(run: Path, rng: random.Random) -> str:
     next(run.glob("rollouts/*/episodes.jsonl")).unlink()
     return "episodes.jsonl is missing"
@@ -235,7 +250,7 @@ def other_renderer(run: Path, rng: random.Random) -> str:
 
 
 OF_EVALUATION: tuple[Attack, ...] = (
-    false_numbers, false_rows, no_rows, other_config, config_of_other_weights, other_renderer,
+    false_numbers, false_rows, false_description, no_rows, other_config, config_of_other_weights, other_renderer,
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 Each consumer has a small whole run of its own, which is restored before every file: some of them write into it.
 """
 
+import json
 import shutil
 import zlib
 from collections.abc import Callable
@@ -16,28 +17,32 @@ from fakes import FakeEnvironment, build_fakes
 from mcap_check import check
 from mcap_to_mp4 import export
 from synthetic import write_episode
-from synthetic_runs import make_run, write_evaluation
+from synthetic_runs import answer_row, make_run, write_evaluation
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
 from fuzzing.mutations import mutate_json, mutate_recording, mutate_safetensors, mutate_yaml
 from fuzzing.readers import Target
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.protocol import CONTINUE, MEASURED, RUNNING, EvaluationOptions
 from imfvla.data import ResumableSampler
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import depth_attention, read_depth_attention
 from imfvla.figures.evaluations import success_by_evaluations
 from imfvla.figures.failures import failed_stages
 from imfvla.figures.learning import learning_curves
+from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.figures.style import style
 from imfvla.figures.two_runs import two_runs
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
-from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.mapping import TableRow, read_mapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import read_offline
 from imfvla.reporting.offline_tables import by_channel, by_step, offline_table
 from imfvla.reporting.page import page
+from imfvla.reporting.recomputed import DESCRIPTION, description_digest
 from imfvla.reporting.results import Result
+from imfvla.reporting.settings import rows_of_settings
+from imfvla.reporting.settings_table import settings_table
 from imfvla.reporting.table_row import print_row
 from imfvla.reporting.tables import other_table
 from imfvla.reporting.two_runs import compare_runs, table_of, verdict
@@ -51,6 +56,7 @@ from imfvla.training.options import TrainingOptions
 
 DRAWN = 20  # one of so many files is drawn too, which takes a hundred times longer
 EVALUATION = EvaluationOptions(episodes=3, first_seed=100_000, nfe=(1,), workers=0, recordings=False)
+SETTINGS, SETTINGS_OF = "table4", "transfer_imf_infer1"
 Consumer = Callable[[], Any]
 
 
@@ -103,9 +109,13 @@ def make_consumers(folder: Path) -> dict[str, Target]:
         if _is_drawn(path):
             _draw(two_runs(duels))
 
+    def in_settings(path: Path) -> None:
+        _report_settings(folder / "settings", is_drawn=_is_drawn(path))
+
     def restored(home: Path, consume: Consumer) -> Callable[[Path], None]:
         return _restored(home, consume)
 
+    settings = make_settings(folder / "settings")
     evaluate_again = restored(evaluated, lambda: _evaluate(evaluated))
     go_on = restored(interrupted, lambda: _evaluate(interrupted))
     resume = restored(resumed, lambda: _resume(resumed))
@@ -115,6 +125,7 @@ def make_consumers(folder: Path) -> dict[str, Target]:
         "report_config": (reported.path / "config.yaml", report, mutate_yaml),
         "report_metrics": (reported.metrics, report, mutate_json),
         "report_depth_attention": (reported.path / "depth_attention.json", report, mutate_json),
+        **{f"settings_{name}": (path, in_settings, mutate_json) for name, path in settings.items()},
         "report_offline": (offline, lambda path: _report_offline(RunDirectory(path.parent)), mutate_json),
         "compare_summary": (rollouts / "summary.json", compare, mutate_json),
         "compare_episodes": (rollouts / "episodes.jsonl", compare, mutate_json),
@@ -160,6 +171,51 @@ def _report(run: RunDirectory, *, is_drawn: bool) -> None:
         for figure in (learning_curves(results), success_by_evaluations(results), failed_stages(results)):
             _draw(figure)
         _draw(depth_attention([weights]))
+
+
+def make_settings(folder: Path) -> dict[str, Path]:
+    """A row of the tables in the unchanged world, on a running clock with a measured delay, and with a bump."""
+    row, *changed = _rows_of_settings()
+    answer_row(folder, row)
+    latency = {
+        "median_ms": 120.0,
+        "p95_ms": 130.0,
+        "calls": 20,
+        "at": "2026-11-28T00:00:00+00:00",
+        "load": 1.0,
+    }
+    found = {}
+    for name, other in zip(("running", "bump"), changed, strict=True):
+        path = answer_row(folder, other, quality=0.3, **dict(other.changes)) / "summary.json"
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        if name == "running":
+            summary["protocol"]["delay_steps"] = 6
+            summary["latency_alone"] = {**latency, "nfe": summary["nfe"]}
+        write_json(path, summary | {DESCRIPTION: description_digest(summary)} if name == "bump" else summary)
+        found[name] = path
+    return found
+
+
+def _rows_of_settings() -> list[TableRow]:
+    """Of three episodes, so that they are read quickly."""
+    mapping = read_mapping()
+    base = next(row for row in mapping.rows if row.name == SETTINGS_OF)
+    entries = [
+        {"clock": RUNNING, "delay_ms": MEASURED, "meanwhile": CONTINUE},
+        {"condition": "bump", "severity": 2},
+    ]
+    rows = [base, *rows_of_settings(entries, SETTINGS, [base.name], {base.name: base}, Path("tables.yaml"))]
+    return [replace(row, wanted=replace(row.wanted, episodes=3)) for row in rows]
+
+
+def _report_settings(folder: Path, *, is_drawn: bool) -> None:
+    mapping, sources = read_mapping(), Sources([folder])
+    results = [Result.of(sources.answer(row, mapping)) for row in _rows_of_settings()]
+    document = settings_table(replace(mapping.table(SETTINGS), rows=(SETTINGS_OF,)), results)
+    document.shown.markdown(), document.data.csv(), document.shown.latex(), document.shown.print()
+    if is_drawn:
+        for draw in (success_by_delay, success_by_severity):
+            _draw(draw(results))
 
 
 def _report_offline(run: RunDirectory) -> None:

@@ -23,26 +23,35 @@ from fuzzing.mutations import (
 )  # fmt: skip
 from imfvla.command.composition import compose
 from imfvla.command.rehearsal import checked_options, rehearse
+from imfvla.config.protocol import Protocol
 from imfvla.data import FrameStore
 from imfvla.errors import UserError
 from imfvla.figures.depth_attention import read_depth_attention
+from imfvla.modes.recordings import choose_recordings
 from imfvla.nn.pretrained import read_weights
 from imfvla.recording import read_episode, read_index
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.runs import evaluations
+from imfvla.reporting.shipping import command_of, provenance
+from imfvla.rollouts.latency import FILE as LATENCY
+from imfvla.rollouts.latency import latency_of
 from imfvla.rollouts.rollout_log import PARTIAL, RolloutLog
+from imfvla.sources.collection import LOG_NAME, recording_path
 from imfvla.sources.mcap import McapSource
 from imfvla.storage.files import write_json
+from imfvla.storage.fingerprint import fingerprint
 from imfvla.storage.metrics import read_metrics
-from imfvla.storage.run_directory import RunDirectory
+from imfvla.storage.run_directory import OVERRIDES, RunDirectory
+from imfvla.storage.trained_config import refuse_changed_config, trained_data
 from imfvla.training.checkpoint import load_weights, save_weights
 from imfvla.training.train_state import TrainState, load_state, save_state
 
 SLOW = {"config", "options", "tables"}  # YAML, and a policy that is built
 QUICK = 16
 ROOT = Path(__file__).resolve().parents[2]
+PROTOCOL = Protocol("fake", "default", 3, "0" * 16, 1, 0, 1.0, 100_000, 3, None, "cpu")
 TINY = (
     "observation.image_size=[32,32]",
     "size.width=32",
@@ -106,6 +115,24 @@ def make_readers(folder: Path) -> dict[str, Target]:
     tables = folder / "tables.yaml"
     tables.write_bytes((ROOT / "experiments" / "tables.yaml").read_bytes())
 
+    latencies = run.path / LATENCY
+    taken = {"median_ms": 5.0, "p95_ms": 6.0, "calls": 20, "at": "2026-11-28T00:00:00+00:00", "load": 1.0}
+    latency_of(run, PROTOCOL, lambda: taken)
+    described = run.weights_directory(3)
+    save_weights(
+        described, model, {"step": 3, "train_s": 1.0, "fingerprint": fingerprint(), "config": run.config()}
+    )
+    run.keep_overrides(["+exp=socket_ph32_exec16", "seed=1"])
+    write_json(folder / "collected" / LOG_NAME, {"settings": {}, "failed_seeds": [1, 2]})
+    for seed in (0, 3, 5):
+        recording_path(folder / "collected", seed).touch()
+    demos = {"demos": {"first_seed": 0, "episodes": 2}}
+
+    def made_by(run: RunDirectory) -> None:
+        refuse_changed_config(run, run.config(), 3)
+        trained_data(run, 3)
+        provenance(run, described / "policy.safetensors", [])
+
     def in_run(read: Callable[[RunDirectory], Any]) -> Callable[[Path], Any]:
         return lambda path: read(run)
 
@@ -126,6 +153,14 @@ def make_readers(folder: Path) -> dict[str, Target]:
         "pretrained": (kept, lambda path: read_weights(path, "encoder"), mutate_safetensors),
         "config": (run.path / "config.yaml", in_run(RunDirectory.config), mutate_yaml),
         "status": (run.path / "status.json", in_run(RunDirectory.status), mutate_json),
+        "latency": (latencies, in_run(lambda run: latency_of(run, PROTOCOL, lambda: taken)), mutate_json),
+        "made_by": (described / "policy.json", in_run(made_by), mutate_json),
+        "overrides": (run.path / OVERRIDES, in_run(lambda run: command_of(run, {"name": "x"})), mutate_json),
+        "collected": (
+            folder / "collected" / LOG_NAME,
+            lambda path: choose_recordings(demos, path.parent, None, 2),
+            mutate_json,
+        ),
         "summary": (rollouts / "summary.json", in_run(report), mutate_json),
         "episodes": (rollouts / "episodes.jsonl", lambda path: read_episodes(path, seeds), mutate_json),
         "partial": (folder / "partial" / PARTIAL, reopen, mutate_json),
@@ -165,6 +200,14 @@ def outside_readers(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Any]
         for name, file in files.items():
             mutate = mutate_json if file.endswith(".json") else mutate_bytes
             readers[f"lerobot_{name}"] = (whole / file, open_lerobot, mutate)
+        named = folder / "named"
+        with lerobot.LeRobotWriter(named, outside.ROBOT, pictures="png") as writer:
+            writer.add(outside.episode(0))
+
+        def open_named(path: Path) -> None:
+            lerobot.open_source(outside.options("lerobot", path=str(named))).episode(0, ("front",))
+
+        readers["lerobot_robot"] = (named / "meta" / "imfvla_robot.json", open_named, mutate_json)
     with suppress(UserError):  # without mcap-ros2-support
         from bags import write_bag
 

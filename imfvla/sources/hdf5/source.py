@@ -233,7 +233,7 @@ def _files(path: Path, where: str) -> list[Path]:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """demo_2 before demo_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _state(parts: Any, key: str) -> dict[str, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -86,7 +87,7 @@ class Info:
 
 def home_of(root: Path) -> Path:
     """Where files of the data set in `root` may lie: there, or beside it in the Hub's cache, whose files are links."""
-    real = root.resolve()
+    real = Path(os.path.realpath(root))  # unlike `resolve` also of a link that leads to itself
     return real.parents[1] if real.parent.name == "snapshots" else real
 
 
@@ -177,7 +178,7 @@ def inside(info: Info, key: str, template: str, **values: str | int) -> Path:
     if re.search(r"[{}\0]", name) or len(name) > 1000:
         raise misfit(info.path, key, f"a path with holes for {', '.join(values)}", template, DOWNLOAD)
     path = info.root / name
-    if ".." in Path(name).parts or not path.resolve().is_relative_to(info.home):
+    if ".." in Path(name).parts or not Path(os.path.realpath(path)).is_relative_to(info.home):
         raise misfit(
             info.path, key, "a path inside the data set", shortened(name), "use a data set that you trust"
         )

@@ -103,7 +103,7 @@ def _supported(path: Path) -> Path:
 
 def _natural(name: str) -> list[tuple[int, str]]:
     """name_2 before name_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def received(bag: Bag, topics: Collection[str]) -> Iterator[Received]:
