@@ -145,7 +145,7 @@ class ChunkActor:
 
     def _known(self, advance: int) -> Known | None:
         """What the robot does by its last chunk, `advance` steps after that was decided: the chunk on the move."""
-        if self._prefix == NO_PREFIX or self._last is None:
+        if self._prefix == NO_PREFIX or self._last is None or advance >= len(self._last[1]):
             return None
         going_on = np.clip(self._last[1][advance:], self._minimum, self._maximum)
         steps = len(self._last[1])
