@@ -67,6 +67,7 @@ class EpisodeResult:
     wall_s: float
     goal: str | None = None  # the task of the episode, where its scene serves several
     chunk_jump: float | None = None  # mean of the jumps, where its actor told them
+    condition_happened: bool | None = None  # of a condition that is an event, whether it came
 
 
 class Actor(Protocol):

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imfvla.config.condition import NONE, SEVERITIES
-from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, RUNNING
+from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, NO_PREFIX, RUNNING
 from imfvla.figures.panels import look, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
@@ -33,7 +33,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
                 method: [
                     (_delay(result), result)
                     for result in found
-                    if result.row.label == method
+                    if _line(result) == method
                     and _change(result, "condition", NONE) == condition
                     and _change(result, "meanwhile", HOLD if _is_running(result) else meanwhile) == meanwhile
                 ]
@@ -65,7 +65,7 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
                 method: [
                     (_change(result, "severity", 0), result)
                     for result in found
-                    if result.row.label == method and _change(result, "condition", NONE) in (NONE, condition)
+                    if _line(result) == method and _change(result, "condition", NONE) in (NONE, condition)
                 ]
                 for method in methods
             }
@@ -107,7 +107,13 @@ def _finish(figure: Figure, left: Sequence[Axes]) -> None:
 
 
 def _methods(results: Sequence[Result]) -> list[str]:
-    return list(dict.fromkeys(result.row.label for result in results))
+    return list(dict.fromkeys(map(_line, results)))
+
+
+def _line(result: Result) -> str:
+    """The name of a line: the method, and how its chunks begin where that is not left to chance."""
+    prefix = _change(result, "prefix", NO_PREFIX)
+    return result.row.label if prefix == NO_PREFIX else f"{result.row.label}, {prefix} prefix"
 
 
 def _change(result: Result, key: str, usual: object) -> object:

@@ -51,6 +51,7 @@ class Row(TypedDict):
     failure: Name | None
     goal: NotRequired[Name]
     chunk_jump: NotRequired[Annotated[float, within(0, LARGEST)]]
+    condition_happened: NotRequired[bool]
     timing: Timing
 
 
@@ -122,6 +123,7 @@ class Summary(TypedDict):
     inference_ms_p95: NotRequired[Positive | None]
     success_interval: NotRequired[Annotated[list[Share], of_length(2)]]
     success_of_goal: NotRequired[Mapping[str, Annotated[list[Count], of_length(2)]]]
+    condition_happened: NotRequired[Annotated[list[Count], of_length(2)]]
     failures: NotRequired[Annotated[Mapping[str, Count], at_most(1000)]]
     name: FileName
     experiment: Name
