@@ -35,7 +35,7 @@ class Decision:
     chunk: np.ndarray | None = None  # float32 (Tp, A), where it replanned
     inference_ms: float | None = None  # from numpy observation to numpy chunk, where it replanned
     jump: float | None = (
-        None  # distance from the last chunk over the steps of both, as a share of the actions' ranges
+        None  # distance from the last chunk over the steps left of both, as a share of the actions' ranges
     )
 
 

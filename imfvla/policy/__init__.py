@@ -89,6 +89,16 @@ class Policy(nn.Module):
         loss, logs = self.generator.loss(core, context, actions, valid, rng)
         return loss.mean(), logs
 
+    def context(self, obs: Observation) -> Any:
+        """What the core makes of observations when no action is given."""
+        return self._free(self.encoder(obs))
+
+    def _free(self, tokens: Tensor) -> Any:
+        if self.prefix is not None:
+            actions = tokens.new_zeros(len(tokens), *self.noise_shape)
+            tokens = self.prefix(tokens, actions, actions[..., 0] > 0)
+        return self.core.condition(tokens)
+
     def _given(self, tokens: Tensor, actions: Tensor, given: Tensor) -> tuple[Any, Any]:
         """Core and context for tokens (B, L, D) where some of the actions (B, Tp, A) are `given` (B, Tp)."""
         context = self.core.condition(self.prefix(tokens, actions, given))
@@ -144,23 +154,19 @@ class Policy(nn.Module):
         draws = len(noise) // len(state)
         if draws > 1:
             tokens, state = tokens.repeat_interleave(draws, 0), state.repeat_interleave(draws, 0)
-        core, target = self.core, None
-        actions = noise if known is None else self.chunks.normalise(known.actions.unsqueeze(0), state)
-        if known is not None and known.weights is not None:
+        if known is None:
+            chunk = self.generator.sample(self.core, self._free(tokens), noise, nfe)
+            return self.chunks.denormalise(chunk, state)
+        actions = self.chunks.normalise(known.actions.unsqueeze(0), state)
+        if known.weights is not None:
             target = Target(actions, known.weights)
-        if self.prefix is None:
-            context = core.condition(tokens)
+            chunk = self.generator.inpaint(self.core, self._free(tokens), noise, nfe, target)
         else:
-            count = known.decided if known is not None and target is None else 0
-            counts = torch.full((len(noise),), count, device=noise.device)
+            counts = torch.full((len(noise),), known.decided, device=noise.device)
             core, context = self._given(tokens, actions, first_steps(counts, noise.shape[1]))
-        if target is None:
             chunk = self.generator.sample(core, context, noise, nfe)
-        else:
-            chunk = self.generator.inpaint(core, context, noise, nfe, target)
         chunk = self.chunks.denormalise(chunk, state)
-        if known is not None:
-            chunk[:, : known.decided] = known.actions[: known.decided]
+        chunk[:, : known.decided] = known.actions[: known.decided]
         return chunk
 
 
