@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_policy import batch, policy
+from small_policy import batch, config, policy
 
 from imfvla.errors import UserError
 from imfvla.nn.forward_mode import jvp
@@ -43,7 +43,25 @@ ACT = {
         "dropout": 0.0,
     },
 }
+STAGED = {
+    "generator": {
+        "_target_": "imfvla.generators.staged.StagedMeanFlow",
+        "parametrisation": "data",
+        "times": {"_target_": "imfvla.generators.base.UniformTimes"},
+        "boundary_share": 1.0,
+        "average_from": 0.5,
+        "path_steps": 2,
+        "velocity_head": True,
+        "time_power": 2.0,
+        "adaptive_power": 0.5,
+        "adaptive_offset": 1e-3,
+        "draws": 2,
+        "clip": 1.0,
+    },
+    "core": config()["core"] | {"velocity_head": True},
+}
 METHODS = {
+    "iMF in two stages": (STAGED, 2),
     "iMF": ({}, 1),
     "iMF in two steps": ({}, 2),
     "L2": ({"generator": REGRESSION}, 1),
@@ -153,6 +171,19 @@ def test_every_method_learns_and_writes_the_decided_actions_as_they_are(changes,
             assert torch.equal(chunk[:, :decided], going_on[:decided].expand(3, -1, -1))
             assert chunk.isfinite().all()
             assert torch.equal(chunk, free) == (decided == 0)
+
+
+def test_the_second_stage_follows_the_flow_from_what_is_given():
+    made, data = policy(horizon=HORIZON, **STAGED), batch()
+    made.begin_step(1, 2)
+    torch.nn.init.normal_(made.core.average.output.weight, std=0.1)
+    made.loss(data, torch.Generator().manual_seed(1))[0].backward()
+    learned = {name for name, weights in made.named_parameters() if weights.grad is not None}
+    assert learned
+    assert all(name.startswith("core.average.") for name in learned)
+    chunk = made.predict(data.obs, torch.randn(3, 8, 16), 1, Known(data.actions[0], 2)).detach()
+    assert torch.equal(chunk[:, :2], data.actions[0, :2].expand(3, -1, -1))
+    assert all(made.spans(2)[name] == (0, 1) for name, _ in made.prefix.named_parameters(prefix="prefix"))
 
 
 def test_a_guided_chunk_has_the_decided_actions_and_comes_nearer_to_the_others():
