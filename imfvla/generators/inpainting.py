@@ -61,5 +61,6 @@ def pull(
         z = z.detach().requires_grad_()
         clean, other = estimate(z)
         error = target.weights[:, None].to(clean) * (target.values - clean.detach())
-        (found,) = torch.autograd.grad(clean, z, error)
+        # Of a scalar: with the gradient of a tensor, PyTorch's first call takes a second for imports.
+        (found,) = torch.autograd.grad((clean * error).sum(), z)
     return clean.detach(), other.detach(), found
