@@ -190,10 +190,9 @@ def test_figures_have_a_line_for_every_method(results):
     assert [len(axes.containers) for axes in delays.axes] == [2, 2, 1, 1]
     x = [line.get_xdata().tolist() for line in delays.axes[1].lines if len(line.get_xdata()) == 2]
     assert [0.0, 120.0] in x
-    guided = [
-        replace(r, row=replace(r.row, changes=(*r.row.changes, ("prefix", "guided")))) for r in results[2:3]
-    ]
-    labels = success_by_delay([*results, *guided]).axes[1].get_legend_handles_labels()[1]
+    row = replace(results[2].row, changes=(*results[2].row.changes, ("prefix", "guided")))
+    guided = Result.of(replace(results[2].answer, row=row))
+    labels = success_by_delay([*results, guided]).axes[1].get_legend_handles_labels()[1]
     assert labels[-1] == f"{results[2].row.label}, guided prefix"
     severities = success_by_severity(results)
     assert severities.axes[0].get_title(loc="left") == "bump"
