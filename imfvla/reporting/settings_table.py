@@ -137,8 +137,8 @@ def _events(results: Sequence[Result]) -> list[str]:
         if _has_event(result):
             counts.setdefault(label(result.row.changes), []).append(condition_happened(result.episodes))
     return [
-        f"{text}: the event came in {sum(came for came, _ in told)} of {sum(all_ for _, all_ in told)} episodes of all "
-        "rows; in the others a hand was there before."
+        f"{text}: the event came in {sum(came for came, _ in told)} of {sum(every for _, every in told)} episodes of "
+        "all rows."
         for text, told in counts.items()
     ]
 
