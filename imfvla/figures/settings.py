@@ -51,11 +51,13 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
         name for name in dict.fromkeys(_change(r, "condition", NONE) for r in found) if name != NONE
     ]
     methods = _methods(found)
-    rows = -(-max(len(conditions), 1) // COLUMNS)
+    count = max(len(conditions), 1)
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
     with style():
         figure = new_figure(WIDTH, 0.9 + 2.2 * rows)
-        axes = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
-        for axis in axes[max(len(conditions), 1) :]:
+        axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        for axis in axes[count:]:
             axis.set_axis_off()
         for axis, condition in zip(axes, conditions or [NONE], strict=False):
             axis.set_title(condition if conditions else "")
@@ -70,7 +72,7 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
                 for method in methods
             }
             _draw(axis, lines, methods)
-        _finish(figure, axes[: max(len(conditions), 1) : COLUMNS])
+        _finish(figure, axes[:count:columns])
     return figure
 
 
