@@ -35,7 +35,7 @@ class Decision:
     chunk: np.ndarray | None = None  # float32 (Tp, A), where it replanned
     inference_ms: float | None = None  # from numpy observation to numpy chunk, where it replanned
     jump: float | None = (
-        None  # distance from the last chunk over the steps of both, as a share of the actions' ranges
+        None  # distance from the last chunk over the steps left of both, as a share of the actions' ranges
     )
 
 
@@ -67,6 +67,7 @@ class EpisodeResult:
     wall_s: float
     goal: str | None = None  # the task of the episode, where its scene serves several
     chunk_jump: float | None = None  # mean of the jumps, where its actor told them
+    condition_happened: bool | None = None  # of a condition that is an event, whether it came
 
 
 class Actor(Protocol):

@@ -149,6 +149,9 @@ class KnownPolicy:
     def check_sampling(self, nfe: int, noise_scale: float, noise: str = "fresh") -> None:
         pass
 
+    def check_replanning(self, nfe: int, candidates: int, prefix: str) -> None:
+        pass
+
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         pixels = obs.images[0, :, 0, 0, 0].int().numpy()  # (To, W) of the red channel's first line
         steps = 256 * pixels[:, 0] + pixels[:, 1]

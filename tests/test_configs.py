@@ -11,12 +11,13 @@ from synthetic import write_demonstrations
 
 from imfvla.command.composition import CONFIG_DIRECTORY, compose
 from imfvla.config.construction import construct
-from imfvla.config.protocol import EvaluationOptions
+from imfvla.config.protocol import MEASURED, USUAL, EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.nn.residual import AttentionResidual
 from imfvla.policy import build_policy
 from imfvla.reporting.mapping import read_mapping
 from imfvla.robot_of import robot_of
+from imfvla.rollouts.clock import delay_steps
 from imfvla.rollouts.evaluation import evaluate
 from imfvla.sources.mcap import McapSource
 from imfvla.storage.run_directory import RunDirectory
@@ -174,3 +175,19 @@ def test_batches_depend_on_seed_and_number_alone(demonstrations):
         loader.close()
     assert np.array_equal(first.obs.images, second.obs.images)
     assert torch.equal(first.actions, second.actions)
+
+
+def test_every_setting_of_the_tables_is_one_that_its_row_can_be_evaluated_in():
+    """A delay that chunks cover, a prefix that the generator can make, candidates that differ."""
+    policies = {}
+    for row in (row for row in read_mapping().rows if row.changes):
+        key = row.experiment, row.overrides
+        if key not in policies:
+            policies[key] = build_policy(compose("train", [f"+exp={row.experiment}", *row.overrides]))
+        policy, changes = policies[key], USUAL | dict(row.changes)
+        if changes["delay_ms"] != MEASURED:
+            rate = policy.robot.control_hz
+            delay_steps(changes["delay_ms"], rate, policy.horizon, changes["meanwhile"], changes["prefix"])
+        policy.check_sampling(row.nfe, changes["noise_scale"], changes["noise"])
+        policy.check_replanning(row.nfe, changes["candidates"], changes["prefix"])
+    assert policies

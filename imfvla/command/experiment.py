@@ -51,9 +51,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     is_trained = options.training.steps in run.weight_steps()
     config = with_robot(config)
     refuse_long_delay(config, options.evaluation)
-    policy = rehearse(
-        config, options.evaluation.nfe, options.evaluation.noise_scale, options.evaluation.noise
-    )
+    policy = rehearse(config, options.evaluation)
     source = None
     if not is_trained:
         source = _check_source(config)

@@ -1,12 +1,12 @@
 """Finds before the first stage what would fail later: options out of range, a policy that cannot learn."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 
 from imfvla.config.construction import reason_of
-from imfvla.config.protocol import FRESH, USUAL_NOISE
+from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
@@ -41,17 +41,17 @@ def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
     return options
 
 
-def rehearse(
-    config: Mapping[str, Any], nfe: Sequence[int], noise_scale: float = USUAL_NOISE, noise: str = FRESH
-) -> Policy:
+def rehearse(config: Mapping[str, Any], evaluation: EvaluationOptions) -> Policy:
     """The configured policy, after the losses of its first and last step and a chunk on black pictures.
 
-    Raises UserError where it cannot be built, cannot compute them, or does not support one of the NFEs.
+    Raises UserError where it cannot be built, cannot compute them, or cannot be evaluated as is wanted.
     """
+    nfe = evaluation.nfe
     try:
         policy = build_unfitted(config).eval()
         for number in nfe:
-            policy.check_sampling(number, noise_scale, noise)
+            policy.check_sampling(number, evaluation.noise_scale, evaluation.noise)
+            policy.check_replanning(number, evaluation.candidates, evaluation.prefix)
         observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
         valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
         with torch.no_grad():

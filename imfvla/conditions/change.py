@@ -46,6 +46,10 @@ class Change:
     def before_step(self, env: Environment, step: int) -> None:
         """Happens at the beginning of control step `step`, after the policy has looked."""
 
+    def happened(self) -> bool | None:
+        """Of an event, whether it has come in this episode; None for what holds all the time."""
+        return None
+
     def after_step(self, env: Environment, step: int) -> None:
         """Happens at the end of a control step; the next one is `step`."""
 
@@ -81,6 +85,11 @@ class ChangedWorld:
         self._step += 1
         self._change.after_step(self._env, self._step)
         return outcome
+
+    @property
+    def condition_happened(self) -> bool | None:
+        """Whether an event, such as a bump, has come in this episode; None for what holds all the time."""
+        return self._change.happened()
 
     def _draws(self, *step: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self._seed, STREAM, *step]))

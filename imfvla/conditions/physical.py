@@ -132,7 +132,7 @@ class Bump(_Simulated):
     """Once in the approach an object that no hand touches is shifted on what it lies on, by `level`.
 
     Moment, direction and object are drawn; a direction in which it would meet something is turned by an eighth.
-    Nothing happens where all objects are held at that moment.
+    Nothing happens where all objects are held at that moment; rows say whether it did.
     """
 
     LEVELS = (0.03, 0.045, 0.06)  # m
@@ -143,6 +143,10 @@ class Bump(_Simulated):
         self._at = int(rng.integers(first, last, endpoint=True))
         self._angle = rng.uniform(0, 2 * np.pi)
         self._rng = rng
+        self._has_shifted = False
+
+    def happened(self) -> bool:
+        return self._has_shifted
 
     def before_step(self, env: Environment, step: int) -> None:
         if step == self._at:
@@ -165,6 +169,7 @@ class Bump(_Simulated):
                 mujoco.mj_forward(model, data)
                 if _at_rest(model, data, body):
                     data.qvel[dof : dof + 6] = 0
+                    self._has_shifted = True
                     return
             data.qpos[position : position + 2] = before
 

@@ -19,12 +19,15 @@ class Horizon:
 
     With `ensemble`, the decay of `imfvla.rollouts.ensemble.TemporalEnsemble`, every step is a decision (exec = 1) and
     the executed action is a mean over all chunks that cover it.
+
+    With `prefix_max`, the policy learns to complete up to so many first actions of a chunk that are decided already.
     """
 
     obs: int
     pred: int
     exec: int
     ensemble: float | None = None
+    prefix_max: int = 0
 
     def __post_init__(self) -> None:
         for name in ("obs", "pred", "exec"):
@@ -33,6 +36,16 @@ class Horizon:
                 raise UserError(
                     f"horizon.{name} must be a whole number between 1 and {MAX_STEPS}, found {value!r}."
                 )
+        longest = self.pred - 1
+        if (
+            isinstance(self.prefix_max, bool)
+            or not isinstance(self.prefix_max, int)
+            or not 0 <= self.prefix_max <= longest
+        ):
+            raise UserError(
+                f"horizon.prefix_max must be a whole number between 0 and {longest}, horizon.pred - 1, found "
+                f"{self.prefix_max!r}."
+            )
         if self.exec > self.pred:
             raise UserError(
                 f"horizon.exec must not exceed horizon.pred: only predicted actions can be executed, "

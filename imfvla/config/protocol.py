@@ -15,6 +15,7 @@ FRESH, HELD, ROLLED, ZERO = NOISES = "fresh", "held", "rolled", "zero"
 MOST_CANDIDATES = 64
 PAUSED, RUNNING = CLOCKS = "paused", "running"
 HOLD, CONTINUE = MEANWHILE = "hold", "continue"
+NO_PREFIX, GUIDED, TRAINED = PREFIXES = "none", "guided", "trained"
 MEASURED = "measured"
 MOST_DELAY_MS = 10_000
 # Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
@@ -57,6 +58,8 @@ class EvaluationOptions:
       clock: "paused", where the world waits while the policy computes, or "running".
       delay_ms: on a running clock, the time from a look to its chunk; "measured" takes this policy's own.
       meanwhile: what the robot does until then: "hold" its last target, or "continue" with its present chunk.
+      prefix: what makes a late chunk begin as the present one goes on: "guided", where a sampler of several steps is
+        corrected towards it, "trained", in a policy with `horizon.prefix_max`, or "none".
       condition: how the world differs from the one that was trained in.
       device: where the policy computes.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
@@ -77,6 +80,7 @@ class EvaluationOptions:
     clock: Annotated[str, one_of(*CLOCKS)] = PAUSED
     delay_ms: Annotated[int | float | str, DELAY] = MEASURED
     meanwhile: Annotated[str, one_of(*MEANWHILE)] = HOLD
+    prefix: Annotated[str, one_of(*PREFIXES)] = NO_PREFIX
     condition: ConditionOptions = UNCHANGED
     device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
     workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
@@ -97,6 +101,9 @@ class EvaluationOptions:
             value = getattr(self, key)
             needless = self.clock == PAUSED and value != usual
             require(not needless, key, f"{usual} with clock=paused: set clock=running for another", value)
+        aimless = self.meanwhile != CONTINUE and self.prefix != NO_PREFIX
+        wanted = f"{NO_PREFIX} unless the robot goes on meanwhile: set clock=running meanwhile={CONTINUE} for another"
+        require(not aimless, "prefix", wanted, self.prefix)
 
     @property
     def is_running(self) -> bool:
@@ -122,6 +129,7 @@ class EvaluationOptions:
             "clock": self.clock,
             "delay_ms": self.delay_ms if self.is_running else 0,
             "meanwhile": self.meanwhile,
+            "prefix": self.prefix,
             "condition": self.condition.name,
             "severity": self.condition.severity,
         }
@@ -150,6 +158,7 @@ class Protocol:
     )
     delay_steps: int = 0  # the same in control steps, rounded up
     meanwhile: str = HOLD
+    prefix: str = NO_PREFIX
     condition: str = NONE
     severity: int | None = None
 
@@ -173,6 +182,7 @@ class Protocol:
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
+            f"-{self.prefix}": self.prefix != NO_PREFIX,
             f"_{self.condition}{self.severity}": self.condition != NONE,
         }
         suffixes = "".join(text for text, applies in unusual.items() if applies)
@@ -194,6 +204,7 @@ USUAL = {
     "delay_ms": 0,
     "delay_steps": 0,
     "meanwhile": HOLD,
+    "prefix": NO_PREFIX,
     "condition": NONE,
     "severity": None,
 }
@@ -218,6 +229,8 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
         delay = "measured delay" if source == MEASURED else f"delay {source:g} ms"
         counted = "" if steps is None else f" ({steps} {'step' if steps == 1 else 'steps'})"
         said.append(f"{delay}{counted}, {protocol['meanwhile']}")
+    if protocol["prefix"] != NO_PREFIX:
+        said.append(f"{protocol['prefix']} prefix")
     if protocol["condition"] != NONE:
         said.append(f"{protocol['condition']} {protocol['severity']}")
     return tuple(said)

@@ -56,7 +56,7 @@ def policy_graphs(policy: Policy, nfe: int) -> dict[str, bytes]:
         )
 
     def observe(images: Tensor, state: Tensor, instruction: Tensor) -> tuple[Tensor, ...]:
-        return policy.core.condition(policy.encoder(Observation(images, state, instruction))).tensors()
+        return policy.context(Observation(images, state, instruction)).tensors()
 
     with torch.no_grad():
         context = observe(*inputs)

@@ -128,6 +128,7 @@ def run_episode(
             wall_s=time.perf_counter() - began,
             goal=env.goal,
             chunk_jump=float(np.mean(jumps)) if jumps else None,
+            condition_happened=getattr(env, "condition_happened", None),
         )
         for sink in sinks:
             sink.end(result)

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imfvla.config.condition import NONE, SEVERITIES
-from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, RUNNING
+from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, NO_PREFIX, RUNNING
 from imfvla.figures.panels import look, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
@@ -33,7 +33,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
                 method: [
                     (_delay(result), result)
                     for result in found
-                    if result.row.label == method
+                    if _line(result) == method
                     and _change(result, "condition", NONE) == condition
                     and _change(result, "meanwhile", HOLD if _is_running(result) else meanwhile) == meanwhile
                 ]
@@ -51,11 +51,13 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
         name for name in dict.fromkeys(_change(r, "condition", NONE) for r in found) if name != NONE
     ]
     methods = _methods(found)
-    rows = -(-max(len(conditions), 1) // COLUMNS)
+    count = max(len(conditions), 1)
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
     with style():
         figure = new_figure(WIDTH, 0.9 + 2.2 * rows)
-        axes = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
-        for axis in axes[max(len(conditions), 1) :]:
+        axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        for axis in axes[count:]:
             axis.set_axis_off()
         for axis, condition in zip(axes, conditions or [NONE], strict=False):
             axis.set_title(condition if conditions else "")
@@ -65,12 +67,12 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
                 method: [
                     (_change(result, "severity", 0), result)
                     for result in found
-                    if result.row.label == method and _change(result, "condition", NONE) in (NONE, condition)
+                    if _line(result) == method and _change(result, "condition", NONE) in (NONE, condition)
                 ]
                 for method in methods
             }
             _draw(axis, lines, methods)
-        _finish(figure, axes[: max(len(conditions), 1) : COLUMNS])
+        _finish(figure, axes[:count:columns])
     return figure
 
 
@@ -107,7 +109,13 @@ def _finish(figure: Figure, left: Sequence[Axes]) -> None:
 
 
 def _methods(results: Sequence[Result]) -> list[str]:
-    return list(dict.fromkeys(result.row.label for result in results))
+    return list(dict.fromkeys(map(_line, results)))
+
+
+def _line(result: Result) -> str:
+    """The name of a line: the method, and how its chunks begin where that is not left to chance."""
+    prefix = _change(result, "prefix", NO_PREFIX)
+    return result.row.label if prefix == NO_PREFIX else f"{result.row.label}, {prefix} prefix"
 
 
 def _change(result: Result, key: str, usual: object) -> object:

@@ -24,6 +24,7 @@ class ActionChunking:
     """
 
     core_interface = "style"
+    uses_noise = False
 
     def __init__(self, *, kl_weight: Annotated[float, at_least(0)], clip: Annotated[float, above(0)]) -> None:
         self.kl_weight = kl_weight

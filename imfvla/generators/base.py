@@ -32,8 +32,8 @@ class Generator(Protocol):
     Generators of this package have `clip` too: normalised actions are taken to lie within [-clip, clip], and `sample`
     clamps the chunk to that.
 
-    Optional, where a generator has them: `DrawsNoise`, `HasStages`, and `times`, a `TimeSampler` that the config group
-    `generator/times` chooses.
+    Optional, where a generator has them: `DrawsNoise`, `HasStages`, `inpainting.Inpaints`, `uses_noise`, false where
+    chunks do not depend on the noise, and `times`, a `TimeSampler` that the config group `generator/times` chooses.
     """
 
     core_interface: str  # how it calls the core: "flow", "flow and v-head" or "style"
@@ -83,6 +83,11 @@ class HasStages(Protocol):
 def draws_noise(generator: Generator, nfe: int) -> bool:
     """`DrawsNoise.draws_noise`, false for a generator without it."""
     return isinstance(generator, DrawsNoise) and generator.draws_noise(nfe)
+
+
+def uses_noise(generator: Generator) -> bool:
+    """Whether a chunk depends on the noise: a generator for which it does not says `uses_noise = False`."""
+    return getattr(generator, "uses_noise", True)
 
 
 LAST_STEP = within(0.01, 0.99)  # a time between noise and data

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, ancestral_noise, masked_error, refuse_nfe, step_times
+from imfvla.generators.inpainting import Target, pull, strength
 from imfvla.options import above
 
 MAX_BETA = 0.999
@@ -102,6 +103,23 @@ class DenoisingDiffusion:
             x, noise = signal * z - spread * output, signal * output + spread * z
         return x.clamp(-self.clip, self.clip) if self.clip_sample else x, noise
 
+    def guided_estimate(
+        self, core: nn.Module, z: Tensor, k: int, context: Any, target: Target | None
+    ) -> tuple[Tensor, Tensor]:
+        """`estimate`, drawn towards `target`, if any.
+
+        With s = sqrt(abar) + sqrt(1 - abar), z / s lies on the linear path at t = sqrt(1 - abar) / s, for which the
+        guidance is defined (`inpainting`).
+        """
+        if target is None:
+            return self.estimate(core, z, k, context)
+        x, noise, towards = pull(lambda z: self.estimate(core, z, k, context), z, target)
+        signal, spread = self.kept[k] ** 0.5, (1 - self.kept[k]) ** 0.5
+        scale = signal + spread
+        t = spread / scale
+        shift = strength(t) * scale * towards
+        return x + t * shift, noise - (1 - t) * shift
+
     def check_nfe(self, nfe: int) -> None:
         """There are no more evaluations than noise levels."""
         if not 1 <= nfe <= self.num_levels:
@@ -113,27 +131,37 @@ class DenoisingDiffusion:
 
     def sample(self, core: nn.Module, context: Any, noise: Tensor, nfe: int) -> Tensor:
         """A chunk (B, H, A): ancestral where `nfe` is the number of levels, else DDIM."""
+        return self.inpaint(core, context, noise, nfe)
+
+    def inpaint(
+        self, core: nn.Module, context: Any, noise: Tensor, nfe: int, target: Target | None = None
+    ) -> Tensor:
+        """`sample`, whose estimates of the clean chunk are drawn towards `target`, if any."""
         self.check_nfe(nfe)
         walk = self.ancestral if self.draws_noise(nfe) else self.ddim
-        return walk(core, context, noise, nfe).clamp(-self.clip, self.clip)
+        return walk(core, context, noise, nfe, target).clamp(-self.clip, self.clip)
 
-    def ddim(self, core: nn.Module, context: Any, z: Tensor, nfe: int) -> Tensor:
+    def ddim(
+        self, core: nn.Module, context: Any, z: Tensor, nfe: int, target: Target | None = None
+    ) -> Tensor:
         """z_j = sqrt(abar_j) x + sqrt(1 - abar_j) e over trailing levels; the last estimate of x is the sample."""
         levels = trailing_levels(self.num_levels, nfe, self.last_step)
         for k, following in pairwise(levels):
-            x, noise = self.estimate(core, z, k, context)
+            x, noise = self.guided_estimate(core, z, k, context, target)
             z = self.kept[following] ** 0.5 * x + (1 - self.kept[following]) ** 0.5 * noise
-        return self.estimate(core, z, levels[-1], context)[0]
+        return self.guided_estimate(core, z, levels[-1], context, target)[0]
 
-    def ancestral(self, core: nn.Module, context: Any, z: Tensor, nfe: int) -> Tensor:
+    def ancestral(
+        self, core: nn.Module, context: Any, z: Tensor, nfe: int, target: Target | None = None
+    ) -> Tensor:
         """z_{k-1} drawn from the posterior given z_k and the estimate of x, with noise that follows from the first."""
         later = ancestral_noise(z, nfe - 1)
         for k in range(nfe - 1, 0, -1):
-            x, _ = self.estimate(core, z, k, context)
+            x, _ = self.guided_estimate(core, z, k, context, target)
             before, now = self.kept[k - 1], self.kept[k]
             alpha = now / before
             of_x = before**0.5 * (1 - alpha) / (1 - now)
             of_z = alpha**0.5 * (1 - before) / (1 - now)
             std = ((1 - before) / (1 - now) * (1 - alpha)) ** 0.5
             z = of_x * x + of_z * z + std * later[nfe - 1 - k]
-        return self.estimate(core, z, 0, context)[0]
+        return self.guided_estimate(core, z, 0, context, target)[0]

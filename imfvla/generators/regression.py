@@ -20,6 +20,7 @@ class Regression:
     """
 
     core_interface = "flow"
+    uses_noise = False
 
     def __init__(self, *, clip: Annotated[float, above(0)], power: Annotated[int, one_of(1, 2)]) -> None:
         self.clip, self.power = clip, power

@@ -30,6 +30,7 @@ class TwoStepRegression:
     """
 
     core_interface = "flow"
+    uses_noise = False
 
     def __init__(
         self,

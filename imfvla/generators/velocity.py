@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
+from imfvla.generators.inpainting import Target, pull, strength
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
 
@@ -68,6 +69,10 @@ class LinearPath:
             return output
         return (z - output) / t[:, None, None]
 
+    def instant_velocity(self, core: nn.Module, z: Tensor, t: Tensor, context: Any) -> Tensor:
+        """v(z, t), u where the interval has no length: z (B, H, A), t (B,) -> (B, H, A)."""
+        return self.velocity(core, z, t, t, context)
+
     def draw_times(self, count: int, rng: torch.Generator) -> Tensor:
         """Times t (count,) to train at; in the data form none is below MIN_TIME.
 
@@ -107,6 +112,21 @@ class LinearPath:
         for t, r in pairwise(step_times(nfe, self.last_step).to(noise)):
             ts, rs = t.expand(len(z)), r.expand(len(z))
             z = z - (t - r) * self.velocity(core, z, rs, ts, context)
+        return z.clamp(-self.clip, self.clip)
+
+    def inpaint(self, core: nn.Module, context: Any, noise: Tensor, nfe: int, target: Target) -> Tensor:
+        """Euler steps of the instantaneous velocity, whose clean chunk z - t v is drawn towards `target`."""
+        self.check_nfe(nfe)
+        z = noise
+        for t, r in pairwise(step_times(nfe, self.last_step).to(noise)):
+            ts = t.expand(len(z))
+
+            def estimate(z: Tensor, t: Tensor = t, ts: Tensor = ts) -> tuple[Tensor, Tensor]:
+                v = self.instant_velocity(core, z, ts, context)
+                return z - t * v, v
+
+            _, v, towards = pull(estimate, z, target)
+            z = z - (t - r) * (v - strength(float(t)) * towards)
         return z.clamp(-self.clip, self.clip)
 
 

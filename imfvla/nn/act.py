@@ -44,6 +44,7 @@ class ActCore(nn.Module):
         if width % heads:
             raise UserError(f"core.heads must divide core.width={width}, found {heads}.")
         layer = (width, heads, int(mlp_ratio * width), dropout)
+        self.width = width
         self.state_token = state_token
         self.style_width = style_width
 

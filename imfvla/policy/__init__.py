@@ -11,13 +11,15 @@ from torch import Tensor, nn
 
 from imfvla.config.construction import construct, reason_of
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import FRESH, ROLLED, USUAL_NOISE, ZERO
+from imfvla.config.protocol import FRESH, GUIDED, NO_PREFIX, ROLLED, TRAINED, USUAL_NOISE, ZERO
 from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
-from imfvla.generators.base import Generator, HasStages, draws_noise
+from imfvla.generators.base import Generator, HasStages, draws_noise, uses_noise
+from imfvla.generators.inpainting import Inpaints, Target
 from imfvla.policy.budget import SizeBudget
 from imfvla.policy.chunks import ChunkFrame
+from imfvla.policy.prefix import GivenContext, GivenCore, Known, PrefixInput, first_steps
 from imfvla.robot import RobotSpec
 from imfvla.robot_of import robot_of, with_robot
 from imfvla.types import Batch, Observation
@@ -47,6 +49,7 @@ class Policy(nn.Module):
         self.core = core
         self.generator = generator
         self.chunks = chunks
+        self.prefix: PrefixInput | None = None  # of policies that complete what is decided already
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -75,10 +78,33 @@ class Policy(nn.Module):
 
     def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
-        actions = self.targets(batch)
-        context = self.core.condition(self.encoder(batch.obs))
-        loss, logs = self.generator.loss(self.core, context, actions, batch.valid, rng)
+        actions, valid, tokens = self.targets(batch), batch.valid, self.encoder(batch.obs)
+        if self.prefix is None:
+            core, context = self.core, self.core.condition(tokens)
+        else:
+            counts = self.prefix.draw(len(actions), rng).to(actions.device)
+            given = first_steps(counts, actions.shape[1])
+            core, context = self._given(tokens, actions, given)
+            valid = valid & ~given
+        loss, logs = self.generator.loss(core, context, actions, valid, rng)
         return loss.mean(), logs
+
+    def context(self, obs: Observation) -> Any:
+        """What the core makes of observations when no action is given."""
+        return self._free(self.encoder(obs))
+
+    def _free(self, tokens: Tensor) -> Any:
+        if self.prefix is not None:
+            actions = tokens.new_zeros(len(tokens), *self.noise_shape)
+            tokens = self.prefix(tokens, actions, actions[..., 0] > 0)
+        return self.core.condition(tokens)
+
+    def _given(self, tokens: Tensor, actions: Tensor, given: Tensor) -> tuple[Any, Any]:
+        """Core and context for tokens (B, L, D) where some of the actions (B, Tp, A) are `given` (B, Tp)."""
+        context = self.core.condition(self.prefix(tokens, actions, given))
+        if self.core.interface == "style":  # has no noisy input
+            return self.core, context
+        return GivenCore(self.core), GivenContext(context, actions, given.unsqueeze(-1))
 
     def check_sampling(self, nfe: int, noise_scale: float, noise: str = FRESH) -> None:
         """Raises UserError where the generator cannot sample in `nfe` evaluations from noise of this scale and kind."""
@@ -96,17 +122,52 @@ class Policy(nn.Module):
                 "noise_scale=1 or another nfe."
             )
 
-    def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
+    def check_replanning(self, nfe: int, candidates: int, prefix: str) -> None:
+        """Raises UserError where so many candidates are all the same, or where chunks cannot begin as `prefix` says.
+
+        `EvaluationOptions` has both options.
+        """
+        name = type(self.generator).__name__
+        if candidates > 1 and not uses_noise(self.generator):
+            raise UserError(
+                f"candidates must be 1 with {name}, found {candidates}: its chunk does not depend on the "
+                "noise, so that all samples are equal."
+            )
+        if prefix == TRAINED and self.prefix is None:
+            raise UserError(
+                f"prefix={TRAINED} needs a policy that was trained with horizon.prefix_max above 0, found 0: train "
+                f"one, or set prefix={NO_PREFIX}, or prefix={GUIDED} for a sampler of several steps."
+            )
+        if prefix == GUIDED and (nfe == 1 or not isinstance(self.generator, Inpaints)):
+            raise UserError(
+                f"prefix={GUIDED} corrects a sample between its steps, and {name} with nfe={nfe} has none: take more "
+                f"steps of a flow, Mean Flow or diffusion; or train with horizon.prefix_max and set prefix={TRAINED}."
+            )
+
+    def predict(self, obs: Observation, noise: Tensor, nfe: int, known: Known | None = None) -> Tensor:
         """Action chunks (K B, Tp, A) in physical units from noise (K B, Tp, A) and `nfe` calls of the core.
 
-        Each observation is encoded once and serves K rows of noise that lie side by side.
+        Each observation is encoded once and serves K rows of noise that lie side by side. The chunks begin with the
+        decided actions of `known`.
         """
         tokens, state = self.encoder(obs), obs.state[:, -1]
         draws = len(noise) // len(state)
         if draws > 1:
             tokens, state = tokens.repeat_interleave(draws, 0), state.repeat_interleave(draws, 0)
-        chunk = self.generator.sample(self.core, self.core.condition(tokens), noise, nfe)
-        return self.chunks.denormalise(chunk, state)
+        if known is None:
+            chunk = self.generator.sample(self.core, self._free(tokens), noise, nfe)
+            return self.chunks.denormalise(chunk, state)
+        actions = self.chunks.normalise(known.actions.unsqueeze(0), state)
+        if known.weights is not None:
+            target = Target(actions, known.weights)
+            chunk = self.generator.inpaint(self.core, self._free(tokens), noise, nfe, target)
+        else:
+            counts = torch.full((len(noise),), known.decided, device=noise.device)
+            core, context = self._given(tokens, actions, first_steps(counts, noise.shape[1]))
+            chunk = self.generator.sample(core, context, noise, nfe)
+        chunk = self.chunks.denormalise(chunk, state)
+        chunk[:, : known.decided] = known.actions[: known.decided]
+        return chunk
 
 
 def hold_last(actions: Tensor, valid: Tensor) -> Tensor:
@@ -148,6 +209,8 @@ def build_policy(config: Mapping[str, Any], statistics: Statistics | None = None
                 ),
                 generator=construct(config["generator"], "generator", Generator),
             )
+            if horizon.prefix_max:
+                policy.prefix = PrefixInput(horizon.prefix_max, len(robot.action), policy.core.width)
     except KeyError as error:
         raise UserError(
             f"the configuration lacks the key {error.args[0]!r} that a policy is built from."

@@ -159,8 +159,15 @@ def summarise(rows: Episodes) -> dict[str, Any]:
         **{metric.name: metric.of(rows) for metric in METRICS},
         "success_interval": list(wilson_interval(int(successes(rows).sum()), len(rows))),
         **({"success_of_goal": success_of_goal(rows)} if "goal" in rows[0] else {}),
+        **({"condition_happened": condition_happened(rows)} if "condition_happened" in rows[0] else {}),
         "failures": dict(sorted(Counter(row["failure"] for row in rows if row["failure"]).items())),
     }
+
+
+def condition_happened(rows: Sequence[Row]) -> list[int]:
+    """[episodes in which the event of a condition came, all episodes that say whether it did]."""
+    told = [row["condition_happened"] for row in rows if "condition_happened" in row]
+    return [sum(told), len(told)]
 
 
 def success_of_goal(rows: Sequence[Row]) -> dict[str, list[int]]:

@@ -11,6 +11,7 @@ from imfvla.reporting.media import Media
 from imfvla.reporting.page_rows import anchor, differences_of, rollouts_of
 from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
+from imfvla.reporting.settings import label
 from imfvla.reporting.table import FILL, Table
 from imfvla.reporting.table_row import machine
 
@@ -76,6 +77,9 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
             cells[0] = f'<a href="#{_anchor(keys[0])}">{cells[0]}</a>'
         elif len(keys) > 1:
             cells[0] += "".join(f' <a href="#{_anchor(key)}">{html_text(key)}</a>' for key in keys)
+        if table.cell_keys:
+            linked = zip(cells[1:], table.cell_keys[len(lines)], strict=True)
+            cells[1:] = [_linked(cell, named.get(key)) for cell, key in linked]
         kind = "paper" if "paper" in row else "missing" if "missing" in row else ""
         filled = [f"<td{_class(n)}>{cell}</td>" for cell, n in zip(cells, numeric, strict=True)]
         filled[1:1] = [f"<td>{rollouts}</td>"] * any(shown)
@@ -83,6 +87,13 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
     notes = "".join(f'<p class="note">{html_text(note)}</p>' for note in table.notes)
     body = f"<thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody>"
     return f'<div class="scroll"><table class="sortable">{body}</table></div>{notes}{_commands(table)}'
+
+
+def _linked(cell: str, result: Result | None) -> str:
+    """A cell that leads to its result, if that is measured."""
+    if result is None or result.is_missing:
+        return cell
+    return f'<a href="#{_anchor(result.name)}">{cell}</a>'
 
 
 def _cell(text: str, is_number: bool) -> str:
@@ -114,11 +125,16 @@ def _figure(picture: Picture) -> str:
 
 def _row(result: Result, media: Media) -> str:
     title = f"{result.row.label}, nfe {result.nfe}" if result.row else result.name
+    is_setting = bool(result.row and result.row.changes)
+    if is_setting:
+        title += f", {label(result.row.changes)}"
     if result.is_missing:
         content = f"<p>Missing. {FILL}<br><code>{html_text(result.answer.command)}</code></p>"
         title += ": missing"
     else:
         content = "".join(_evaluated(found, media) for found in result.evaluated)
+        if is_setting:  # other rows have theirs in a table
+            content = rollouts_of(result, media) + content
     return f'<details id="{_anchor(result.name)}"><summary>{html_text(title)}</summary>{content}</details>'
 
 

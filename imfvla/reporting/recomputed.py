@@ -23,8 +23,8 @@ DESCRIBED = (
 )
 RECORDINGS = "recordings"  # key of summary.json, with the returns of the episodes that were recorded
 OF_LATENCY = ("weights", "nfe", "candidates", "device")
-OF_RUNNING = ("delay_ms", "delay_steps", "meanwhile")  # keys of a protocol
-OF_SOME_TASKS = ("success_of_goal",)  # metrics that not every evaluation has
+OF_RUNNING = ("delay_ms", "delay_steps", "meanwhile", "prefix")  # keys of a protocol
+OF_SOME = ("success_of_goal", "condition_happened")  # metrics that not every evaluation has
 log = logging.getLogger(__name__)
 
 
@@ -60,7 +60,7 @@ def recomputed(
         raise UserError(
             f"{folder / EPISODES} gives another {', '.join(wrong)} than its summary.json: one was changed; {REMEDY}."
         )
-    rest = {key: value for key, value in summary.items() if key not in (*metrics, *OF_SOME_TASKS)}
+    rest = {key: value for key, value in summary.items() if key not in (*metrics, *OF_SOME)}
     if isinstance(recordings := summary.get(RECORDINGS), Mapping):
         rest[RECORDINGS] = _with_returns(folder, recordings, rows)
     return metrics | rest, rows

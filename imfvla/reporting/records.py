@@ -7,7 +7,15 @@ from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
 from imfvla.config.condition import SEVERITIES
-from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE, MOST_CANDIDATES, NOISES
+from imfvla.config.protocol import (
+    CLOCKS,
+    DELAY,
+    MAX_EPISODES,
+    MEANWHILE,
+    MOST_CANDIDATES,
+    NOISES,
+    PREFIXES,
+)
 from imfvla.options import above, at_most, of_length, one_of, within
 from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
 
@@ -43,6 +51,7 @@ class Row(TypedDict):
     failure: Name | None
     goal: NotRequired[Name]
     chunk_jump: NotRequired[Annotated[float, within(0, LARGEST)]]
+    condition_happened: NotRequired[bool]
     timing: Timing
 
 
@@ -70,6 +79,7 @@ class ProtocolRecord(TypedDict):
     delay_ms: NotRequired[Annotated[int | float | str, DELAY]]
     delay_steps: NotRequired[Annotated[int, within(0, MOST_STEPS)]]
     meanwhile: NotRequired[Annotated[str, one_of(*MEANWHILE)]]
+    prefix: NotRequired[Annotated[str, one_of(*PREFIXES)]]
     noise: NotRequired[Annotated[str, one_of(*NOISES)]]
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     condition: NotRequired[Name]
@@ -82,6 +92,7 @@ class Latency(TypedDict):
     weights: NotRequired[Name]
     nfe: NotRequired[Nfe]
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
+    prefix: NotRequired[Annotated[str, one_of(*PREFIXES)]]
     device: NotRequired[Name]
     machine: NotRequired[Machine]
     median_ms: Positive
@@ -113,6 +124,7 @@ class Summary(TypedDict):
     inference_ms_p95: NotRequired[Positive | None]
     success_interval: NotRequired[Annotated[list[Share], of_length(2)]]
     success_of_goal: NotRequired[Mapping[str, Annotated[list[Count], of_length(2)]]]
+    condition_happened: NotRequired[Annotated[list[Count], of_length(2)]]
     failures: NotRequired[Annotated[Mapping[str, Count], at_most(1000)]]
     name: FileName
     experiment: FileName

@@ -21,6 +21,7 @@ def row_of(result: EpisodeResult) -> Row:
         "failure": result.failure,
         **({"goal": result.goal} if result.goal else {}),
         **({} if result.chunk_jump is None else {"chunk_jump": round(result.chunk_jump, 9)}),
+        **({} if result.condition_happened is None else {"condition_happened": result.condition_happened}),
         TIMING: {
             "wall_s": round(result.wall_s, 6),
             "inference_ms": [round(value, 3) for value in result.inference_ms],

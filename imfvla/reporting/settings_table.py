@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
 from imfvla.reporting.mapping_tables import TableTitle
 from imfvla.reporting.measured import Measured
+from imfvla.reporting.metrics import condition_happened
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result
 from imfvla.reporting.settings import label, name_of
@@ -19,8 +20,9 @@ METRICS = ("success_share", "avg_return", "chunk_jump", "inference_ms_mean")
 COLUMNS = (
     "row", "setting", "nfe", "episodes", "success",
     *(f"{name}{end}" for name in METRICS for end in ("", "_low", "_high")),
-    "delay_steps", "latency_alone_ms", "success_difference", "success_difference_low", "success_difference_high", "p",
-    "p_holm", "return_difference", "return_difference_low", "return_difference_high", "return_p", "status", "command",
+    "delay_steps", "latency_alone_ms", "condition_happened",
+    "success_difference", "success_difference_low", "success_difference_high", "p", "p_holm",
+    "return_difference", "return_difference_low", "return_difference_high", "return_p", "status", "command",
 )  # fmt: skip
 
 
@@ -56,19 +58,23 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     settings = list(dict.fromkeys(label(one.result.row.changes) for one in found))
     cells = {(label(one.result.row.changes), one.usual.name): one for one in found}
     rows = [(UNCHANGED, *(_usual_cell(result) for result in usual.values()))]
-    rows += [(text, *(_cell(cells.get((text, name))) for name in usual)) for text in settings]
+    lines = [tuple(cells.get((text, name)) for name in usual) for text in settings]
+    rows += [(text, *map(_cell, line)) for text, line in zip(settings, lines, strict=True)]
+    keys = [tuple(usual), *(tuple(one.result.name if one else "" for one in line) for line in lines)]
     measured = [one for one in found if one.success]
     notes = [
         "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
         f"from the same starts. A star: p below {ALPHA} (exact McNemar, Holm over {len(measured)} comparisons). A "
         "dash: the setting is in no line for this row.",
         *(_sentence(usual[name], [one for one in measured if one.usual.name == name]) for name in usual),
+        *_events([one.result for one in found]),
         *(f"{one.result.name}: refused, because {one.refused}." for one in found if one.refused),
     ]
     is_missing = any(one.result.is_missing or one.usual.is_missing for one in found)
     commands = ((table.name, f"python -m imfvla.train -m +sweep={table.sweep}"),) if is_missing else ()
     columns = ("World", *(f"{result.row.method} ({result.row.setting})" for result in usual.values()))
-    shown = Table(table.title, columns, tuple(rows), tuple(note for note in notes if note), (), commands)
+    notes = tuple(note for note in notes if note)
+    shown = Table(table.title, columns, tuple(rows), notes, commands=commands, cell_keys=tuple(keys))
     data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
     return Document(shown, Table(table.title, COLUMNS, tuple(data)))
 
@@ -124,6 +130,23 @@ def _sentence(usual: Result, measured: Sequence[Changed]) -> str:
     )
 
 
+def _events(results: Sequence[Result]) -> list[str]:
+    """For each setting whose condition is an event, in how many episodes it came."""
+    counts: dict[str, list[list[int]]] = {}
+    for result in results:
+        if _has_event(result):
+            counts.setdefault(label(result.row.changes), []).append(condition_happened(result.episodes))
+    return [
+        f"{text}: the event came in {sum(came for came, _ in told)} of {sum(every for _, every in told)} episodes of "
+        "all rows."
+        for text, told in counts.items()
+    ]
+
+
+def _has_event(result: Result) -> bool:
+    return not result.is_missing and any("condition_happened" in row for row in result.episodes)
+
+
 def _data(one: Changed) -> tuple[str, ...]:
     result, row = one.result, one.result.row
     summaries = [found.evaluation.summary for found in result.evaluated]
@@ -134,6 +157,7 @@ def _data(one: Changed) -> tuple[str, ...]:
     numbers += [
         max((summary["protocol"]["delay_steps"] for summary in summaries), default=None),
         max(alone, default=None),
+        condition_happened(result.episodes)[0] if _has_event(result) else None,
         *_of(success.result), success.p, one.p_holm, *_of(returns.result), returns.p,
     ]  # fmt: skip
     return (

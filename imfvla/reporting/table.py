@@ -38,7 +38,8 @@ NUMERIC = rf"{NOTHING}|{MISSING}|{REFUSED}|{VALUE}(?:{INTERVAL})?(?: ms| points)
 class Table:
     """Title, column names, rows of as many cells, and paragraphs below.
 
-    `keys` has, for each row, the names of its results, if any; `commands` fill what is missing, by name.
+    `keys` has, for each row, the names of its results, if any; where a row tells one result a cell, `cell_keys`
+    has them for the cells behind the first, "" for none. `commands` fill what is missing, by name.
     """
 
     title: str
@@ -47,10 +48,12 @@ class Table:
     notes: tuple[str, ...] = ()
     keys: tuple[tuple[str, ...], ...] = ()
     commands: tuple[tuple[str, str], ...] = ()
+    cell_keys: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         assert all(len(row) == len(self.columns) for row in self.rows), self.title
         assert len(self.keys) in (0, len(self.rows)), self.title
+        assert all(len(keys) == len(self.columns) - 1 for keys in self.cell_keys), self.title
 
     def markdown(self) -> str:
         """A Markdown table under a heading."""

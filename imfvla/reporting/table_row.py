@@ -61,6 +61,8 @@ def table_of(found: Sequence[Evaluation]) -> Table:
             )
         for goal, (successes, episodes) in evaluation.summary.get("success_of_goal", {}).items():
             note += f" NFE {evaluation.nfe}, asked for {goal}: {successes}/{episodes}."
+        if happened := evaluation.summary.get("condition_happened"):
+            note += f" NFE {evaluation.nfe}: the condition's event came in {happened[0]} of {happened[1]} episodes."
         for label, count in evaluation.summary["failures"].items():
             note += f" NFE {evaluation.nfe}: {count} failed with {label}."
     return Table(f"{summary['experiment']} ({where})", COLUMNS, tuple(cells), (note,))

@@ -10,12 +10,14 @@ import numpy as np
 import torch
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import CONTINUE, FRESH, USUAL_NOISE
+from imfvla.config.protocol import CONTINUE, FRESH, GUIDED, NO_PREFIX, USUAL_NOISE
 from imfvla.data.resample import resample
 from imfvla.environment import Environment
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.episode import Decision
+from imfvla.generators.inpainting import soft_weights
 from imfvla.policy import Policy
+from imfvla.policy.prefix import Known
 from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.ensemble import TemporalEnsemble
 from imfvla.rollouts.noise import ReplanningNoise, distances
@@ -36,7 +38,8 @@ class ChunkActor:
     the same shape see the same noise. It is multiplied by `noise_scale`; `noise` says what becomes of it from one
     replanning to the next (`rollouts.noise`). Of several `candidates`, sampled as one batch from one encoding, the one
     is taken that is nearest to the last chunk over the steps that both cover (backward coherence of arXiv 2408.17355).
-    With `tells_jumps`, decisions say how far that is, root-mean-square in shares of the actions' ranges.
+    With `tells_jumps`, decisions say how far that is, root-mean-square in shares of the actions' ranges, over the steps
+    that may still be executed. With a `prefix` the policy is told what the robot will do until its chunk is there.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class ChunkActor:
         noise: str = FRESH,
         candidates: int = 1,
         clock: Clock | None = None,
+        prefix: str = NO_PREFIX,
         tells_jumps: bool = False,
     ) -> None:
         self._policy = policy.eval()
@@ -60,6 +64,7 @@ class ChunkActor:
         self._noise = ReplanningNoise(
             policy.noise_shape, noise_seed, kind=noise, scale=noise_scale, candidates=candidates
         )
+        self._prefix = prefix
         self._tells_jumps = tells_jumps
         self._device = torch.device(device)
 
@@ -111,7 +116,7 @@ class ChunkActor:
             )
             self._check(chunk[self._clock.executed(step)])
             jump = self._jump(chunk, step) if self._tells_jumps else None
-            self._last = (step, chunk)
+            self.remember(step, chunk)
             self._coming = (step, chunk)
             self._receive(step)
         if self._coming is None or self._clock.meanwhile == CONTINUE:
@@ -119,15 +124,34 @@ class ChunkActor:
         action = self._target
         return Decision(action, action, images, chunk, inference_ms, jump)
 
+    def remember(self, step: int, chunk: np.ndarray) -> None:
+        """The chunk (Tp, A) decided at `step` becomes the last one, which the next one follows."""
+        self._last = (step, chunk)
+
     def _jump(self, chunk: np.ndarray, step: int) -> float | None:
         """How far a chunk is from the last one; None where there is none, or none that reaches so far."""
         if self._last is None:
             return None
-        (found,) = self._distances(chunk[None], step - self._last[0])
+        (found,) = self._distances(chunk[None], step - self._last[0], self._decided)
         return None if np.isnan(found) else float(found)
 
-    def _distances(self, chunks: np.ndarray, advance: int) -> np.ndarray:
-        return distances(chunks, self._last[1], advance, self._maximum - self._minimum)
+    def _distances(self, chunks: np.ndarray, advance: int, first: int = 0) -> np.ndarray:
+        return distances(chunks, self._last[1], advance, self._maximum - self._minimum, first)
+
+    @property
+    def _decided(self) -> int:
+        """Steps of a chunk that will have been executed from the last one when it is there."""
+        return self._clock.delay if self._clock.meanwhile == CONTINUE else 0
+
+    def _known(self, advance: int) -> Known | None:
+        """What the robot does by its last chunk, `advance` steps after that was decided: the chunk on the move."""
+        if self._prefix == NO_PREFIX or self._last is None or advance >= len(self._last[1]):
+            return None
+        going_on = np.clip(self._last[1][advance:], self._minimum, self._maximum)
+        steps = len(self._last[1])
+        padded = np.concatenate((going_on, np.repeat(going_on[-1:], steps - len(going_on), axis=0)))
+        weights = soft_weights(steps, self._decided, len(going_on)) if self._prefix == GUIDED else None
+        return Known(torch.from_numpy(padded.astype(np.float32)).to(self._device), self._decided, weights)
 
     def _receive(self, step: int) -> None:
         """Takes the chunk that is there from `step` on, if any."""
@@ -145,7 +169,6 @@ class ChunkActor:
             action = self._ensemble.action(step)
         return np.clip(action, self._minimum, self._maximum).astype(np.float32)
 
-    @torch.inference_mode()
     def plan(
         self,
         images: Sequence[Sequence[np.ndarray]],
@@ -161,8 +184,12 @@ class ChunkActor:
         began = time.perf_counter()
         observation = observation_of(images, states, self._words, self._policy.image_size).to(self._device)
         noise = self._noise.draw(replanning, advance)
-        chunks = self._policy.predict(observation, noise.to(self._device), self._nfe)
-        answers = chunks.float().cpu().numpy()  # waits for an accelerator
+        known = self._known(advance)
+        # The guidance is a derivative, which inference mode does not allow.
+        with torch.no_grad() if self._prefix == GUIDED else torch.inference_mode():
+            told = {} if known is None else {"known": known}
+            chunks = self._policy.predict(observation, noise.to(self._device), self._nfe, **told)
+            answers = chunks.float().cpu().numpy()  # waits for an accelerator
         chosen = 0
         if len(answers) > 1 and self._last is not None:
             chosen = int(np.argmin(np.nan_to_num(self._distances(answers, advance), nan=0.0)))

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import CONTINUE, HOLD, MOST_DELAY_MS
+from imfvla.config.protocol import CONTINUE, GUIDED, HOLD, MOST_DELAY_MS, NO_PREFIX, TRAINED
 from imfvla.errors import UserError
 
 FIRST = 0  # step of the first decision, whose chunk is waited for
@@ -75,10 +75,13 @@ def longest_delay(horizon: Horizon) -> int:
     return min(horizon.pred - horizon.exec, horizon.pred // 2)
 
 
-def delay_steps(delay_ms: float, control_hz: float, horizon: Horizon, meanwhile: str) -> int:
+def delay_steps(
+    delay_ms: float, control_hz: float, horizon: Horizon, meanwhile: str, prefix: str = NO_PREFIX
+) -> int:
     """A delay in control steps, rounded up: a chunk that is late by a moment waits for the next step.
 
-    Raises UserError where the horizon cannot bear it, and beyond what an option may say, as a measured one can be.
+    Raises UserError where the horizon cannot bear it, beyond what an option may say, as a measured one can be, or where
+    a policy has learned no prefix that is so long.
     """
     if delay_ms > MOST_DELAY_MS:
         raise UserError(
@@ -101,5 +104,11 @@ def delay_steps(delay_ms: float, control_hz: float, horizon: Horizon, meanwhile:
             f"({1000 * longest / control_hz:g} ms): a chunk of pred={horizon.pred} actions, of which "
             f"exec={horizon.exec} are executed before the policy looks again, covers no more. Lower delay_ms, or set "
             "meanwhile=hold."
+        )
+    if prefix == TRAINED and steps > horizon.prefix_max:
+        learned = f"the policy was trained with horizon.prefix_max={horizon.prefix_max}"
+        raise UserError(
+            f"{found}, and with prefix={TRAINED} so many actions are given, but {learned}: lower delay_ms, train with "
+            f"a larger horizon.prefix_max, or set prefix={NO_PREFIX} or prefix={GUIDED}."
         )
     return steps

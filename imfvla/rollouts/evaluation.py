@@ -120,12 +120,12 @@ def evaluate(
 def refuse_long_delay(config: Mapping[str, Any], options: EvaluationOptions) -> None:
     """Raises UserError where the policy of a config cannot bear the delay; a measured one is not known yet."""
     if options.is_running and not options.is_measured:
-        _delay_steps(config, options.delay_ms, options.meanwhile)
+        _delay_steps(config, options.delay_ms, options)
 
 
-def _delay_steps(config: Mapping[str, Any], delay_ms: float, meanwhile: str) -> int:
+def _delay_steps(config: Mapping[str, Any], delay_ms: float, options: EvaluationOptions) -> int:
     horizon = build_options(Horizon, part_of(config, "horizon"), "horizon")
-    return delay_steps(delay_ms, robot_of(config).control_hz, horizon, meanwhile)
+    return delay_steps(delay_ms, robot_of(config).control_hz, horizon, options.meanwhile, options.prefix)
 
 
 def _timed(
@@ -139,7 +139,7 @@ def _timed(
     if not options.is_running:
         return protocol, None
     if not options.is_measured:
-        return replace(protocol, delay_steps=_delay_steps(config, options.delay_ms, options.meanwhile)), None
+        return replace(protocol, delay_steps=_delay_steps(config, options.delay_ms, options)), None
 
     def measure() -> Latency:
         count = 0 if options.workers == 0 else 1
@@ -149,7 +149,7 @@ def _timed(
 
     latency = latency_of(run, protocol, measure, again=options.overwrite)
     log.info("a chunk takes %.1f ms alone, at a load of %.1f", latency["median_ms"], latency["load"])
-    steps = _delay_steps(config, latency["median_ms"], options.meanwhile)
+    steps = _delay_steps(config, latency["median_ms"], options)
     return replace(protocol, delay_steps=steps), latency
 
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from imfvla.config.protocol import Protocol
+from imfvla.config.protocol import NO_PREFIX, Protocol
 from imfvla.environment import Environment
 from imfvla.reporting.records import MOST_LATENCIES, Latencies, Latency
 from imfvla.rollouts.actor import ChunkActor
@@ -32,7 +32,7 @@ CALLS, FEWEST_CALLS, WARM_UP = (
 def latency_of(
     run: RunDirectory, protocol: Protocol, measure: Callable[[], Latency], *, again: bool = False
 ) -> Latency:
-    """The time of a chunk of these weights with this NFE, so many candidates, on this device and machine.
+    """The time of a chunk of these weights with this NFE, candidates and prefix, on this device and machine.
 
     It is the kept one, or that of `measure`.
 
@@ -40,10 +40,13 @@ def latency_of(
     """
     path = run.path / FILE
     kept = read_record(path, Latencies, REMEDY, home=run.path) if path.exists() else []
-    of = {key: getattr(protocol, key) for key in ("weights", "nfe", "candidates", "device")} | {
-        "machine": machine()
-    }
-    others = [found for found in kept if any(found.get(key) != value for key, value in of.items())]
+    keys = ("weights", "nfe", "candidates", "prefix", "device")
+    of = {key: getattr(protocol, key) for key in keys} | {"machine": machine()}
+    others = [
+        found
+        for found in kept
+        if any({"prefix": NO_PREFIX, **found}.get(key) != value for key, value in of.items())
+    ]
     if len(others) < len(kept) and not again:
         return next(found for found in kept if found not in others)
     found = {**of, **measure()}
@@ -61,7 +64,10 @@ def measure_latency(
     seen = env.look()
     images, states = [[seen[view] for view in views]] * num_observed, [env.state()] * num_observed
     calls, warm_up = max(FEWEST_CALLS, CALLS // nfe), max(1, WARM_UP // nfe)
-    times = [actor.plan(images, states, 0)[1] for _ in range(warm_up + calls)][warm_up:]
+    actor.remember(
+        0, actor.plan(images, states, 0)[0]
+    )  # as the last one, which prefix and candidates look at
+    times = [actor.plan(images, states, 1, 1)[1] for _ in range(warm_up + calls)][warm_up:]
     return {
         "median_ms": round(float(np.median(times)), 3),
         "p95_ms": round(float(np.percentile(times, 95)), 3),

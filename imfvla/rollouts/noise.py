@@ -43,14 +43,16 @@ class ReplanningNoise:
         return drawn
 
 
-def distances(chunks: np.ndarray, last: np.ndarray, advance: int, scale: np.ndarray) -> np.ndarray:
+def distances(
+    chunks: np.ndarray, last: np.ndarray, advance: int, scale: np.ndarray, first: int = 0
+) -> np.ndarray:
     """Root-mean-square distance (N,) of chunks (N, Tp, A) from the last one (Tp, A) over the steps that both cover.
 
-    In shares of `scale` (A,); `advance` is the number of steps from the last decision to this one. Not a number where
-    no step is covered by both.
+    In shares of `scale` (A,); `advance` is the number of steps from the last decision to this one; entries of the new
+    chunks before `first` do not count. Not a number where no step is covered by both.
     """
     shared = len(last) - advance
-    if shared <= 0:
+    if shared <= first:
         return np.full(len(chunks), np.nan)
-    error = (chunks[:, :shared] - last[advance:]) / scale
+    error = (chunks[:, first:shared] - last[advance + first :]) / scale
     return np.sqrt(np.square(error, dtype=np.float64).mean(axis=(1, 2)))

@@ -61,8 +61,9 @@ class World:
 
 
 def describe_world(job: Job) -> World:
-    """Of the environment in which episodes are played."""
-    env, _ = _place(job)
+    """Of the environment in which episodes are played. Raises UserError where the policy cannot play as is wanted."""
+    env, policy = _place(job)
+    actor_of(job.protocol, policy)
     return World(env.renderer(), None if env.goal else env.stages)
 
 
@@ -125,6 +126,7 @@ def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
 def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
     """A policy at work as a protocol says. Raises UserError where it cannot work so."""
     policy.check_sampling(protocol.nfe, protocol.noise_scale, protocol.noise)
+    policy.check_replanning(protocol.nfe, protocol.candidates, protocol.prefix)
     return ChunkActor(
         policy.to(protocol.device),
         policy.horizon,
@@ -135,6 +137,7 @@ def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
         noise=protocol.noise,
         candidates=protocol.candidates,
         clock=Clock(policy.horizon, protocol.delay_steps, protocol.meanwhile),
+        prefix=protocol.prefix,
         tells_jumps=protocol.tells_jumps,
     )
 

@@ -89,9 +89,11 @@ def _known_digests(config: Mapping[str, Any]) -> Iterator[str]:
     """The present one first, then those of each earlier version."""
     yield digest_of_config(config)
     entries = flatten(plain(config))
-    later = [key for keys in LEFT_OUT_LATER for key in keys]
-    ignored = {key for key in EXECUTION_KEYS if key not in later}
+    left_out = [key for keys in LEFT_OUT_LATER for key in keys]
+    ignored = {key for key in EXECUTION_KEYS if key not in left_out}
+    later = list(LATER_KEYS.items())
+    versions = [dict(later[:count]) | entries for count in range(len(later) + 1)]
     for keys in ((), *LEFT_OUT_LATER):
         ignored |= {*keys}
-        yield digest_of_entries(entries, tuple(ignored))
-        yield digest_of_entries(LATER_KEYS | entries, tuple(ignored))
+        for version in versions:
+            yield digest_of_entries(version, tuple(ignored))

@@ -150,6 +150,9 @@ def test_an_object_is_shifted_once_within_the_approach(severity, distance, trans
     assert 10 <= at <= 60
     assert jumps[at] == pytest.approx(distance, abs=1e-3)
     assert abs(places[-1, position + 2] - places[0, position + 2]) < 1e-3
+    assert env.condition_happened is True
+    env.reset(100_001)
+    assert env.condition_happened is False
 
 
 def test_an_object_that_a_hand_touches_is_left_alone(transfer, monkeypatch):
@@ -157,6 +160,7 @@ def test_an_object_that_a_hand_touches_is_left_alone(transfer, monkeypatch):
     env = changed(transfer, "bump", 3)
     env.reset(100_000)
     places = hold(env, 70)
+    assert env.condition_happened is False
     transfer.reset(100_000)
     np.testing.assert_allclose(places, hold(transfer, 70), atol=1e-6)
 

@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from imfvla.command.composition import CONFIG_DIRECTORY, compose
 from imfvla.errors import UserError
-from imfvla.generators.base import HasStages, draws_noise
+from imfvla.generators.base import HasStages, draws_noise, uses_noise
 from imfvla.nn.act import ActCore
 from imfvla.nn.residual import AttentionResidual
 from imfvla.nn.transformer import TransformerCore
@@ -153,6 +153,7 @@ def test_the_sample_is_a_pure_function_of_its_noise(name):
         assert chunk.abs().max() <= generator.clip
         assert torch.equal(chunk, sample(generator, core, noise, nfe))
         assert torch.equal(noise, before)
+        assert torch.equal(chunk, sample(generator, core, -noise, nfe)) != uses_noise(generator)
 
 
 @every_generator

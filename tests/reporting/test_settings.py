@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from imfvla.errors import UserError
 from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.media import Media
+from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
 from imfvla.reporting.settings import label, rows_of_settings
 from imfvla.reporting.settings_table import settings_table
@@ -116,6 +119,53 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
     assert lines[2]["delay_steps"] == "6"
 
 
+def test_cells_lead_to_their_rows_and_rows_show_their_videos(results, tmp_path):
+    folder = results[2].evaluated[0].evaluation.folder
+    (folder / "best_seed1.mp4").write_bytes(b"")
+    results[2].evaluated[0].evaluation.summary["recordings"] = {
+        "best": {"seed": 1, "return": 2.0, "file": "best_seed1.mcap"}
+    }
+    text = page([settings_table(TABLE, results).shown], [], results, Media(tmp_path, is_copied=False))
+    anchor = "row-table4--transfer_imf_infer1--delay-120-ms--continue"
+    assert text.count(f'<a href="#{anchor}">') == 1
+    assert text.count("<video") == 1
+    details = text[text.index(f'<details id="{anchor}">') :]
+    assert details.startswith(
+        f'<details id="{anchor}"><summary>{results[2].row.label}, nfe 1, delay 120 ms, continue'
+    )
+    assert 0 < details.index("<video") < details.index("</dl>")
+    assert f'<a href="#row-{BASES[0]}">' in text  # the unchanged world
+    assert 'href="#row-table4--transfer_l1' not in text  # not measured
+
+
+def test_whether_an_event_came_is_counted(tmp_path):
+    told = Result.of(answered_bump(tmp_path, [True] * 97 + [False] * 3))
+    document = settings_table(TABLE, [*(Result.of(answer) for answer in unchanged(tmp_path)), told])
+    assert any(
+        note.startswith("bump 2: the event came in 97 of 100 episodes") for note in document.shown.notes
+    )
+    lines = list(csv.DictReader(io.StringIO(document.data.csv())))
+    assert lines[-1]["condition_happened"] == "97"
+    assert lines[0]["condition_happened"] == ""
+
+
+def unchanged(root):
+    for name in BASES:
+        answer_row(root, BY_NAME[name])
+    return [Sources([root]).answer(BY_NAME[name], MAPPING) for name in BASES]
+
+
+def answered_bump(root, happened):
+    folder = answer_row(root, BY_NAME[BASES[0]], condition="bump", severity=2)
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    told = [
+        json.loads(line) | {"condition_happened": came} for line, came in zip(lines, happened, strict=True)
+    ]
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in told))
+    (row,) = rows({"condition": "bump", "severity": 2, "rows": [BASES[0]]})
+    return Sources([root]).answer(row, MAPPING)
+
+
 def test_what_is_not_measured_yet_is_said(tmp_path):
     sources = Sources([tmp_path])
     missing = [
@@ -140,6 +190,10 @@ def test_figures_have_a_line_for_every_method(results):
     assert [len(axes.containers) for axes in delays.axes] == [2, 2, 1, 1]
     x = [line.get_xdata().tolist() for line in delays.axes[1].lines if len(line.get_xdata()) == 2]
     assert [0.0, 120.0] in x
+    row = replace(results[2].row, changes=(*results[2].row.changes, ("prefix", "guided")))
+    guided = Result.of(replace(results[2].answer, row=row))
+    labels = success_by_delay([*results, guided]).axes[1].get_legend_handles_labels()[1]
+    assert labels[-1] == f"{results[2].row.label}, guided prefix"
     severities = success_by_severity(results)
     assert severities.axes[0].get_title(loc="left") == "bump"
     assert len(severities.axes[0].containers) == 2

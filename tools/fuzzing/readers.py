@@ -74,7 +74,7 @@ class Target:
 def check_options(path: Path) -> None:
     """What `imfvla.train` checks before its first stage, in a config that is whole JSON."""
     config = json.loads(path.read_bytes())
-    rehearse(config, checked_options(config).evaluation.nfe)
+    rehearse(config, checked_options(config).evaluation)
 
 
 def make_readers(folder: Path) -> dict[str, Target]:
