@@ -16,6 +16,7 @@ MOST_CANDIDATES = 64
 PAUSED, RUNNING = CLOCKS = "paused", "running"
 HOLD, CONTINUE = MEANWHILE = "hold", "continue"
 MEASURED = "measured"
+EAGER, ONNX = RUNTIMES = "eager", "onnx"
 MOST_DELAY_MS = 10_000
 # Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
 # tables are for reporting alone. More demonstrations than the first band has go on behind all of these.
@@ -59,6 +60,7 @@ class EvaluationOptions:
       meanwhile: what the robot does until then: "hold" its last target, or "continue" with its present chunk.
       condition: how the world differs from the one that was trained in.
       device: where the policy computes.
+      runtime: what computes it: "eager", torch, or "onnx", ONNX Runtime with the run's exported graphs.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
       episode_timeout_s: an episode that takes longer is replayed in a fresh worker; None: no limit.
       max_steps: control steps of an episode, None for all.
@@ -79,6 +81,7 @@ class EvaluationOptions:
     meanwhile: Annotated[str, one_of(*MEANWHILE)] = HOLD
     condition: ConditionOptions = UNCHANGED
     device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
+    runtime: Annotated[str, one_of(*RUNTIMES)] = EAGER
     workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
     episode_timeout_s: (
         Annotated[float, above(0), Limit("at most a week", lambda s: s <= MAX_TIMEOUT_S)] | None
@@ -93,6 +96,12 @@ class EvaluationOptions:
         one_noise = self.candidates > 1 and (self.noise != FRESH or self.noise_scale == 0)
         wanted = "1 unless noise is fresh and noise_scale above 0: equal noise gives equal samples"
         require(not one_noise, "candidates", wanted, self.candidates)
+        for key, only in (("candidates", 1), ("device", "cpu")):
+            value = getattr(self, key)
+            fits = self.runtime == EAGER or value == only
+            require(
+                fits, key, f"{only} with runtime=onnx, whose graphs take one observation on the CPU", value
+            )
         for key, usual in (("delay_ms", MEASURED), ("meanwhile", HOLD)):
             value = getattr(self, key)
             needless = self.clock == PAUSED and value != usual
@@ -117,6 +126,7 @@ class EvaluationOptions:
             "episodes": self.episodes,
             "max_steps": self.max_steps,
             "device": self.device,
+            "runtime": self.runtime,
             "noise": self.noise,
             "candidates": self.candidates,
             "clock": self.clock,
@@ -152,6 +162,7 @@ class Protocol:
     meanwhile: str = HOLD
     condition: str = NONE
     severity: int | None = None
+    runtime: str = EAGER  # what computes the policy
 
     @property
     def tells_jumps(self) -> bool:
@@ -172,6 +183,7 @@ class Protocol:
             f"_best{self.candidates}": self.candidates != 1,
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
+            f"_{self.runtime}": self.runtime != EAGER,
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
             f"_{self.condition}{self.severity}": self.condition != NONE,
         }
@@ -196,6 +208,7 @@ USUAL = {
     "meanwhile": HOLD,
     "condition": NONE,
     "severity": None,
+    "runtime": EAGER,
 }
 
 
@@ -220,6 +233,8 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
         said.append(f"{delay}{counted}, {protocol['meanwhile']}")
     if protocol["condition"] != NONE:
         said.append(f"{protocol['condition']} {protocol['severity']}")
+    if protocol["runtime"] != EAGER:
+        said.append("ONNX Runtime")
     return tuple(said)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Annotated, NotRequired, TypedDict
 
 from imfvla.config.condition import SEVERITIES
-from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE, MOST_CANDIDATES, NOISES
+from imfvla.config.protocol import CLOCKS, DELAY, MAX_EPISODES, MEANWHILE, MOST_CANDIDATES, NOISES, RUNTIMES
 from imfvla.options import above, at_most, of_length, one_of, within
 from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
 
@@ -74,6 +74,7 @@ class ProtocolRecord(TypedDict):
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     condition: NotRequired[Name]
     severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
+    runtime: NotRequired[Annotated[str, one_of(*RUNTIMES)]]
 
 
 class Latency(TypedDict):
@@ -83,6 +84,7 @@ class Latency(TypedDict):
     nfe: NotRequired[Nfe]
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     device: NotRequired[Name]
+    runtime: NotRequired[Annotated[str, one_of(*RUNTIMES)]]  # eager where it is older
     machine: NotRequired[Machine]
     median_ms: Positive
     p95_ms: Positive

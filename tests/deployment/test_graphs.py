@@ -2,10 +2,10 @@ import pytest
 import small_policy
 import torch
 
-from imfvla.command.rehearsal import blank_observation
 from imfvla.deployment.graphs import policy_graphs
-from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.errors import UserError
+from imfvla.policy.blank import blank_observation
+from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.types import Observation
 
 pytest.importorskip("onnxscript")
