@@ -25,10 +25,12 @@ def main(config: dict[str, Any]) -> None:
     run = RunDirectory(config["run"])
     trained = run.config()
     # Imported late, so that a mistake in the command is reported at once.
+    from imfvla.deployment.ready import check_runtime, export_missing
     from imfvla.reporting.table_row import print_row
     from imfvla.rollouts.evaluation import evaluate
     from imfvla.training.checkpoint import check_weights
 
+    check_runtime(trained, options)
     if not has_environment(trained):
         from imfvla.reporting.offline_tables import print_offline
         from imfvla.rollouts.offline import evaluate_offline
@@ -37,6 +39,7 @@ def main(config: dict[str, Any]) -> None:
         print_offline(run)
         return
     check_weights(run, options.checkpoint)
+    export_missing(run, options)
     summaries = evaluate(run, options)
     folders = [run.rollouts(summary["name"]) for summary in summaries]
     print_row(run, only=[folder.name for folder in folders])

@@ -14,6 +14,7 @@ from imfvla.config.protocol import CHECKPOINT
 from imfvla.errors import UserError
 from imfvla.evaluate import read_nfe
 from imfvla.options import build, within
+from imfvla.runtime.graphs import FOLDER
 from imfvla.storage.files import refuse_existing
 from imfvla.storage.run_directory import LAST, RunDirectory
 
@@ -37,7 +38,7 @@ def main(config: dict[str, Any]) -> None:
         raise UserError("export needs the directory of a training run: run=runs/<experiment>/<name>.")
     nfe, run = read_nfe(options.nfe), RunDirectory(options.run)
     run.config()
-    folder = run.path / "onnx" if options.output is None else Path(options.output)
+    folder = run.path / FOLDER if options.output is None else Path(options.output)
     refuse_existing(folder, "remove it, or name another folder with output=DIR")
     # Imported late, so that a mistake in the command is reported at once.
     from imfvla.deployment.exporting import export_policy

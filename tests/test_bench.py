@@ -8,13 +8,13 @@ import torch
 from fakes import FakeEnvironment
 
 from imfvla.bench import main
-from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.benchmarks.latency import measure_latency
 from imfvla.benchmarks.sizes import measure_size
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP as PARTS
 from imfvla.benchmarks.tables import latency_table, speed_ratios
 from imfvla.command.composition import compose
 from imfvla.command.rehearsal import build_unfitted
+from imfvla.process.stopwatch import rate, times_ms
 from imfvla.reporting.mapping import read_mapping
 from imfvla.rollouts.threads import threads
 

@@ -102,10 +102,11 @@ LAYERS = [
     "data figures",
     "policy",
     "training",
+    "runtime",
     "modes rollouts",
+    "deployment",
     "command",
     "benchmarks",
-    "deployment",
     "bench collect convert evaluate gallery report scripts train",
     "compare export",
 ]
@@ -120,7 +121,8 @@ ONLY = {
 }
 SIMULATE = "tasks gymnasium_env"
 WHO_MAY = {  # of the heavy packages
-    "torch": "types nn encoders generators data policy training modes rollouts command benchmarks bench deployment",
+    "torch": "types nn encoders generators data policy training runtime modes rollouts deployment command "
+    "benchmarks bench",
     "mujoco": f"{SIMULATE} conditions",
     "dm_control": SIMULATE,
 }

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.sizes import core_inputs
 from imfvla.environment import Environment
 from imfvla.policy import Policy
+from imfvla.process.stopwatch import times_ms
 from imfvla.reporting.bootstrap import bootstrap
 from imfvla.rollouts.actor import ChunkActor, observation_of
 from imfvla.rollouts.threads import threads

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.benchmarks.clock import rate, times_ms
 from imfvla.benchmarks.forcing import forcing
 from imfvla.environment import Environment, bodies_of
+from imfvla.process.stopwatch import rate, times_ms
 from imfvla.recording import Recordings
 from imfvla.sources.collection import collect
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from imfvla.benchmarks.flops import count_flops, training_flops
-from imfvla.command.rehearsal import blank_observation, build_unfitted
+from imfvla.command.rehearsal import build_unfitted
 from imfvla.policy import Policy
+from imfvla.policy.blank import blank_observation
 from imfvla.types import Batch, Observation
 
 

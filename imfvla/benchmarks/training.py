@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
-from imfvla.benchmarks.clock import times_ms
 from imfvla.benchmarks.flops import training_flops
 from imfvla.benchmarks.forcing import measure_saving
 from imfvla.benchmarks.tables import PARTS_OF_A_STEP
 from imfvla.policy import Policy
+from imfvla.process.stopwatch import times_ms
 from imfvla.sources.base import EpisodeSource
 from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.data import make_loader, prepare_windows

@@ -13,6 +13,7 @@ import torch
 from imfvla.command.rehearsal import checked_options, rehearse
 from imfvla.config.views import view_options
 from imfvla.data.held_out import held_out
+from imfvla.deployment.ready import check_runtime, export_missing
 from imfvla.environments import BIMANUAL, environment_of, kind_of
 from imfvla.errors import UserError
 from imfvla.nn.pretrained import initialise_from_pretrained
@@ -51,6 +52,7 @@ def run_experiment(config: Mapping[str, Any], run: RunDirectory, overrides: Sequ
     is_trained = options.training.steps in run.weight_steps()
     config = with_robot(config)
     refuse_long_delay(config, options.evaluation)
+    check_runtime(config, options.evaluation)
     policy = rehearse(config, options.evaluation)
     source = None
     if not is_trained:
@@ -139,6 +141,7 @@ def _run_stages(
                 _train(config, options, run, processes)
                 run.write_status(RUNNING, phase="evaluation", pid=os.getpid())
             if has_environment(config):
+                export_missing(run, options.evaluation)
                 evaluate(run, options.evaluation)  # of a finished evaluation it only reads the summary
             else:
                 evaluate_offline(run, config, options.evaluation)

@@ -10,13 +10,14 @@ from imfvla.config.protocol import EvaluationOptions
 from imfvla.errors import UserError
 from imfvla.options import part_of, require
 from imfvla.policy import Policy, build_policy
+from imfvla.policy.blank import blank_observation
 from imfvla.robot_of import has_environment
 from imfvla.rollouts.evaluation import require_device
 from imfvla.rollouts.offline import refuse_rollout_options
 from imfvla.storage.run_directory import step_of
 from imfvla.training.experiment import ExperimentOptions, read_experiment
 from imfvla.training.loop import choose_device
-from imfvla.types import MAX_WORDS, Batch, Observation
+from imfvla.types import Batch
 
 
 def checked_options(config: Mapping[str, Any]) -> ExperimentOptions:
@@ -83,13 +84,3 @@ def build_unfitted(config: Mapping[str, Any]) -> Policy:
     chunk = torch.zeros(policy.noise_shape)
     policy.chunks.normaliser.fit(chunk, chunk + 1, min_scale=1.0)
     return policy
-
-
-def blank_observation(policy: Policy) -> Observation:
-    """Black pictures, zeros as the state and an empty sentence, of batch 1."""
-    steps = policy.horizon.obs
-    return Observation(
-        images=torch.zeros(1, steps, len(policy.views), 3, *policy.image_size, dtype=torch.uint8),
-        state=torch.zeros(1, steps, len(policy.robot.state)),
-        instruction=torch.zeros(1, MAX_WORDS, dtype=torch.int64),
-    )

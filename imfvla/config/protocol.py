@@ -17,6 +17,7 @@ PAUSED, RUNNING = CLOCKS = "paused", "running"
 HOLD, CONTINUE = MEANWHILE = "hold", "continue"
 NO_PREFIX, GUIDED, TRAINED = PREFIXES = "none", "guided", "trained"
 MEASURED = "measured"
+EAGER, ONNX = RUNTIMES = "eager", "onnx"
 MOST_DELAY_MS = 10_000
 # Start states: below the first are those of demonstrations, from there on those that choices are made on; those of
 # tables are for reporting alone. More demonstrations than the first band has go on behind all of these.
@@ -62,6 +63,7 @@ class EvaluationOptions:
         corrected towards it, "trained", in a policy with `horizon.prefix_max`, or "none".
       condition: how the world differs from the one that was trained in.
       device: where the policy computes.
+      runtime: what computes it: "eager", torch, or "onnx", ONNX Runtime with the run's exported graphs.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
       episode_timeout_s: an episode that takes longer is replayed in a fresh worker; None: no limit.
       max_steps: control steps of an episode, None for all.
@@ -83,6 +85,7 @@ class EvaluationOptions:
     prefix: Annotated[str, one_of(*PREFIXES)] = NO_PREFIX
     condition: ConditionOptions = UNCHANGED
     device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
+    runtime: Annotated[str, one_of(*RUNTIMES)] = EAGER
     workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
     episode_timeout_s: (
         Annotated[float, above(0), Limit("at most a week", lambda s: s <= MAX_TIMEOUT_S)] | None
@@ -97,6 +100,11 @@ class EvaluationOptions:
         one_noise = self.candidates > 1 and (self.noise != FRESH or self.noise_scale == 0)
         wanted = "1 unless noise is fresh and noise_scale above 0: equal noise gives equal samples"
         require(not one_noise, "candidates", wanted, self.candidates)
+        for key, only in (("candidates", 1), ("device", "cpu"), ("prefix", NO_PREFIX)):
+            value = getattr(self, key)
+            fits = self.runtime == EAGER or value == only
+            wanted = f"{only} with runtime=onnx, whose graphs take one observation on the CPU and no decided actions"
+            require(fits, key, wanted, value)
         for key, usual in (("delay_ms", MEASURED), ("meanwhile", HOLD)):
             value = getattr(self, key)
             needless = self.clock == PAUSED and value != usual
@@ -124,6 +132,7 @@ class EvaluationOptions:
             "episodes": self.episodes,
             "max_steps": self.max_steps,
             "device": self.device,
+            "runtime": self.runtime,
             "noise": self.noise,
             "candidates": self.candidates,
             "clock": self.clock,
@@ -161,6 +170,7 @@ class Protocol:
     prefix: str = NO_PREFIX
     condition: str = NONE
     severity: int | None = None
+    runtime: str = EAGER  # what computes the policy
 
     @property
     def tells_jumps(self) -> bool:
@@ -181,6 +191,7 @@ class Protocol:
             f"_best{self.candidates}": self.candidates != 1,
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
+            f"_{self.runtime}": self.runtime != EAGER,
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
             f"-{self.prefix}": self.prefix != NO_PREFIX,
             f"_{self.condition}{self.severity}": self.condition != NONE,
@@ -207,6 +218,7 @@ USUAL = {
     "prefix": NO_PREFIX,
     "condition": NONE,
     "severity": None,
+    "runtime": EAGER,
 }
 
 
@@ -233,6 +245,8 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
         said.append(f"{protocol['prefix']} prefix")
     if protocol["condition"] != NONE:
         said.append(f"{protocol['condition']} {protocol['severity']}")
+    if protocol["runtime"] != EAGER:
+        said.append("ONNX Runtime")
     return tuple(said)
 
 

@@ -6,13 +6,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from imfvla.command.rehearsal import blank_observation
 from imfvla.deployment.graphs import policy_graphs
-from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.deployment.parity import TOLERANCE, largest_difference, latencies, observations
 from imfvla.policy import Policy
+from imfvla.policy.blank import blank_observation
 from imfvla.process.progress import Progress
 from imfvla.reporting.table import Table, number
+from imfvla.runtime.graphs import FORMAT, digest_of_graph
+from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.storage.files import (
     clear_write_errors,
     locked,
@@ -26,7 +27,6 @@ from imfvla.storage.run_directory import RunDirectory
 from imfvla.storage.trained_config import digest_of_config
 from imfvla.training.checkpoint import load_policy
 
-FORMAT = "imfvla-onnx-1"
 EXISTING = "remove it, or name another folder with output=DIR"
 INPUTS = {
     "images": "uint8, one picture of each of `views` at each observed step",
@@ -68,7 +68,8 @@ def export_policy(
                 "checkpoint_step": step,
                 "weights": run.weights_digest(step),
                 "config_digest": digest_of_config(config),
-                "graphs": named,
+                "graphs": {part: file for file, part in named.items()},
+                "digests": {part: digest_of_graph(graph) for part, graph in graphs.items()},
                 **_interface(policy),
                 "parity": {
                     "observations": len(observed),

@@ -16,16 +16,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.command.rehearsal import blank_observation
 from imfvla.config.assets import install_command
+from imfvla.config.construction import reason_of
 from imfvla.errors import UserError
 from imfvla.nn.transformer import Conditioning
 from imfvla.policy import Policy
+from imfvla.policy.blank import blank_observation
+from imfvla.runtime.onnx_policy import CHUNK, OBSERVE, OBSERVED
 from imfvla.types import Observation
 
-MAX_STEPS = 10  # written out in one graph
-OBSERVED = ("images", "state", "instruction")
-CHUNK, OBSERVE = "chunk", "observe"
+MAX_STEPS = 4  # written out in one graph; a longer one takes a minute to write and is no faster
 CALLS = {"flow": ("forward",), "flow and v-head": ("forward", "instant")}  # of the core, by its interface
 
 
@@ -88,15 +88,20 @@ def to_onnx(
     except ImportError:
         raise UserError(f"Exporting needs onnx and onnxscript: {install_command('onnx')}.") from None
     with _quietly():
-        program = torch.onnx.export(
-            module.eval(),
-            example,
-            dynamo=True,
-            verbose=False,
-            input_names=list(inputs),
-            output_names=list(outputs),
-        )
-        return program.model_proto.SerializeToString()
+        try:
+            program = torch.onnx.export(
+                module.eval(),
+                example,
+                dynamo=True,
+                verbose=False,
+                input_names=list(inputs),
+                output_names=list(outputs),
+            )
+            return program.model_proto.SerializeToString()
+        except Exception as error:  # a part of another package can hold anything
+            raise UserError(
+                f"This policy cannot be exported, but evaluated with runtime=eager; torch says {reason_of(error)!r}."
+            ) from error
 
 
 @contextlib.contextmanager

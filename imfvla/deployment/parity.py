@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from imfvla.benchmarks.clock import times_ms
 from imfvla.config.protocol import SELECTION_FIRST_SEED
-from imfvla.deployment.onnx_policy import OnnxPolicy
 from imfvla.environments import environment_of
 from imfvla.errors import UserError
 from imfvla.policy import Policy
 from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
+from imfvla.process.stopwatch import times_ms
 from imfvla.robot_of import has_environment
 from imfvla.rollouts.actor import observation_of
 from imfvla.rollouts.threads import threads
+from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.sources.opening import open_source
 from imfvla.training.data import held_out_windows, prepare_windows
 from imfvla.types import Observation, tokenize

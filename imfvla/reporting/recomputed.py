@@ -22,7 +22,7 @@ DESCRIBED = (
     "fingerprint",
 )
 RECORDINGS = "recordings"  # key of summary.json, with the returns of the episodes that were recorded
-OF_LATENCY = ("weights", "nfe", "candidates", "device")
+OF_LATENCY = ("weights", "nfe", "candidates", "prefix", "device", "runtime")
 OF_RUNNING = ("delay_ms", "delay_steps", "meanwhile", "prefix")  # keys of a protocol
 OF_SOME = ("success_of_goal", "condition_happened")  # metrics that not every evaluation has
 log = logging.getLogger(__name__)

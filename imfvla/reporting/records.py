@@ -15,6 +15,7 @@ from imfvla.config.protocol import (
     MOST_CANDIDATES,
     NOISES,
     PREFIXES,
+    RUNTIMES,
 )
 from imfvla.options import above, at_most, of_length, one_of, within
 from imfvla.storage.records import LARGEST, Duration, FileName, Fingerprint, Label, Machine, Name, Seed, Step
@@ -84,6 +85,7 @@ class ProtocolRecord(TypedDict):
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     condition: NotRequired[Name]
     severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
+    runtime: NotRequired[Annotated[str, one_of(*RUNTIMES)]]
 
 
 class Latency(TypedDict):
@@ -94,6 +96,7 @@ class Latency(TypedDict):
     candidates: NotRequired[Annotated[int, within(1, MOST_CANDIDATES)]]
     prefix: NotRequired[Annotated[str, one_of(*PREFIXES)]]
     device: NotRequired[Name]
+    runtime: NotRequired[Annotated[str, one_of(*RUNTIMES)]]  # eager where it is older
     machine: NotRequired[Machine]
     median_ms: Positive
     p95_ms: Positive

@@ -17,7 +17,10 @@ from imfvla.reporting.mapping_file import named, place_of, plain
 from imfvla.reporting.mapping_row import TableRow
 
 OF_CONDITION = {"condition": "name", "severity": "severity"}  # keys of an entry that are keys of `condition`
-KEYS = ("noise_scale", "noise", "candidates", "clock", "delay_ms", "meanwhile", "prefix", *OF_CONDITION)
+KEYS = (
+    *("noise_scale", "noise", "candidates", "clock", "delay_ms", "meanwhile", "prefix", "runtime"),
+    *OF_CONDITION,
+)
 
 
 def rows_of_settings(

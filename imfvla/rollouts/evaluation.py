@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from imfvla.config.horizon import Horizon
-from imfvla.config.protocol import EvaluationOptions, Protocol
+from imfvla.config.protocol import ONNX, EvaluationOptions, Protocol
 from imfvla.errors import UserError
 from imfvla.options import build as build_options
 from imfvla.options import part_of, require
@@ -30,6 +30,7 @@ from imfvla.rollouts.workbench import (
     record,
     roll_out,
 )
+from imfvla.runtime.graphs import read_graphs, require_packages
 from imfvla.storage.documents import read_json
 from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory, flatten
@@ -54,8 +55,8 @@ def evaluate(
       The summaries, in the order of `nfe`.
 
     Raises:
-      UserError: no run, no such weights, no such device, an episode whose workers died, or a config.yaml that was
-        changed since the weights were trained or other evaluations were made.
+      UserError: no run, no such weights, no such device, no graphs of them for ONNX Runtime, an episode whose
+        workers died, or a config.yaml that was changed since the weights were trained or other evaluations were made.
     """
     require_device(options.device, "device")
     config = run.config()
@@ -66,6 +67,10 @@ def evaluate(
         )
     run.refuse_strangers()
     step = run.weights_step(options.checkpoint)
+    if options.runtime == ONNX:
+        require_packages()
+        for number in options.nfe:
+            read_graphs(run, step, number)
     digest = run.weights_digest(step)
     refuse_changed_config(run, config, step)
     for path in sorted(run.path.glob("rollouts/*/summary.json")):

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from imfvla.config.protocol import NO_PREFIX, Protocol
+from imfvla.config.protocol import EAGER, NO_PREFIX, Protocol
 from imfvla.environment import Environment
 from imfvla.reporting.records import MOST_LATENCIES, Latencies, Latency
 from imfvla.rollouts.actor import ChunkActor
@@ -21,6 +21,8 @@ from imfvla.storage.records import read_record
 from imfvla.storage.run_directory import RunDirectory
 
 FILE = "latency.json"
+OF = ("weights", "nfe", "candidates", "prefix", "device", "runtime")  # keys of a protocol that times depend on
+OLDER = {"prefix": NO_PREFIX, "runtime": EAGER}  # in files that are older than the keys
 REMEDY = "delete it; the times are then taken again"
 CALLS, FEWEST_CALLS, WARM_UP = (
     200,
@@ -32,7 +34,7 @@ CALLS, FEWEST_CALLS, WARM_UP = (
 def latency_of(
     run: RunDirectory, protocol: Protocol, measure: Callable[[], Latency], *, again: bool = False
 ) -> Latency:
-    """The time of a chunk of these weights with this NFE, candidates and prefix, on this device and machine.
+    """The time of a chunk of these weights with this NFE, candidates and prefix, on this device, runtime and machine.
 
     It is the kept one, or that of `measure`.
 
@@ -40,13 +42,8 @@ def latency_of(
     """
     path = run.path / FILE
     kept = read_record(path, Latencies, REMEDY, home=run.path) if path.exists() else []
-    keys = ("weights", "nfe", "candidates", "prefix", "device")
-    of = {key: getattr(protocol, key) for key in keys} | {"machine": machine()}
-    others = [
-        found
-        for found in kept
-        if any({"prefix": NO_PREFIX, **found}.get(key) != value for key, value in of.items())
-    ]
+    of = {key: getattr(protocol, key) for key in OF} | {"machine": machine()}
+    others = [found for found in kept if any({**OLDER, **found}.get(key) != of[key] for key in of)]
     if len(others) < len(kept) and not again:
         return next(found for found in kept if found not in others)
     found = {**of, **measure()}

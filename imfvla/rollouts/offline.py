@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from imfvla.config.condition import UNCHANGED
-from imfvla.config.protocol import FRESH, PAUSED, EvaluationOptions
+from imfvla.config.protocol import EAGER, FRESH, PAUSED, EvaluationOptions
 from imfvla.data import Windows
 from imfvla.data.same_content import refuse_other_content
 from imfvla.errors import UserError
@@ -35,7 +35,13 @@ ROWS = 32  # chunks that are computed together
 
 def refuse_rollout_options(options: EvaluationOptions) -> None:
     """Raises UserError where an option asks for what only an environment has."""
-    for key, usual in (("clock", PAUSED), ("noise", FRESH), ("candidates", 1), ("condition", UNCHANGED)):
+    for key, usual in (
+        ("clock", PAUSED),
+        ("noise", FRESH),
+        ("candidates", 1),
+        ("condition", UNCHANGED),
+        ("runtime", EAGER),
+    ):
         found = getattr(options, key)
         require(found == usual, f"evaluation.{key}", "as usual where there is no environment", found)
 

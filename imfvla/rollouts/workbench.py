@@ -9,7 +9,7 @@ from typing import Any
 
 from imfvla.conditions import changed
 from imfvla.config.condition import NONE
-from imfvla.config.protocol import Protocol, unusual
+from imfvla.config.protocol import ONNX, Protocol, unusual
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
 from imfvla.environments.rollout import run_episode
@@ -19,9 +19,11 @@ from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.latency import measure_latency
 from imfvla.rollouts.threads import threads
+from imfvla.runtime.graphs import read_graphs
+from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.storage.run_directory import RunDirectory
 
-VIDEO_HEIGHT = 240  # of a view [px]
+VIDEO_HEIGHT = 192  # of a view [px]: twice what the policies of the tables see
 
 Build = Callable[[Path, int], tuple[Environment, Any]]  # run directory, training step -> environment, policy
 
@@ -145,7 +147,13 @@ def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
 def _place(job: Job) -> tuple[Environment, Any]:
     """Environment and policy of a job, each made once."""
     protocol = job.protocol
-    return _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+    env, policy = _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+    return env, _exported(policy, job.run, job.step, protocol.nfe) if protocol.runtime == ONNX else policy
+
+
+@lru_cache(maxsize=1)
+def _exported(policy: Any, run: Path, step: int, nfe: int) -> OnnxPolicy:
+    return OnnxPolicy(policy, nfe, read_graphs(RunDirectory(run), step, nfe))
 
 
 @lru_cache(maxsize=1)

@@ -35,6 +35,7 @@ VIDEO = Kind("video", 2 * 2**30)
 WEIGHTS = Kind(
     "file of weights", 32 * 2**30
 )  # pretrained ones; a policy says exactly how many bytes it needs
+GRAPH = Kind("file of a graph", 2 * 2**30)  # more than ONNX can hold in one file
 DATA = Kind("file of a data set", 256 * 2**30)  # read in parts
 ARRAY = Kind("array", math.inf)  # mapped, not read
 OF_SUFFIX = {

@@ -1,5 +1,7 @@
 """Inverse kinematics of one arm: damped least squares on a private copy of the simulation's data."""
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -20,13 +22,20 @@ class ArmKinematics:
 
     def __init__(self, model: mujoco.MjModel, side: str) -> None:
         self._model = model
-        self._data = mujoco.MjData(model)
+        data = self._data = mujoco.MjData(model)
         self._site = model.site(f"{side}/grip").id
         joints = [model.joint(f"{side}/joint_{i}").id for i in range(1, 8)]
         self._qpos = model.jnt_qposadr[joints]
         self._dofs = model.jnt_dofadr[joints]
-        self._low, self._high = model.jnt_range[joints].T
+        low, high = model.jnt_range[joints].T
+        self._limits = list(zip(low.tolist(), high.tolist(), strict=True))
         self._jacobian = np.zeros((6, model.nv))
+        # Views of the simulation's memory and results of `solve`, made once: with 6 and 7 numbers, making arrays costs
+        # more than computing them.
+        self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site]
+        self._rows = self._jacobian[:3], self._jacobian[3:]
+        self._normal, self._reduced = np.zeros((6, 6)), np.zeros(6)
+        self._damping = DAMPING**2 * np.eye(6)
 
     def pose(self, joints: np.ndarray) -> Pose:
         """Grip frame at the joint angles (7,) [rad]."""
@@ -42,24 +51,29 @@ class ArmKinematics:
 
     def solve(self, target: Pose, start: np.ndarray, max_iterations: int = 30) -> np.ndarray:
         """Joint angles (7,) within the limits whose grip frame is nearest to `target`, searched from `start` (7,)."""
-        joints = np.array(start, dtype=np.float64)
+        joints = np.asarray(start, dtype=np.float64).tolist()
+        position, rotation = target.position.tolist(), target.rotation.ravel().tolist()
         for _ in range(max_iterations):
-            self._place(joints)
-            error = np.concatenate(
-                [
-                    target.position - self._data.site_xpos[self._site],
-                    rotation_vector(target.rotation @ self._data.site_xmat[self._site].reshape(3, 3).T),
-                ]
-            )
-            if np.abs(error).max() < TOLERANCE and abs(joints[2]) < 2e-3:
+            self._data.qpos[self._qpos] = joints
+            mujoco.mj_kinematics(self._model, self._data)
+            away = [wanted - here for wanted, here in zip(position, self._position.tolist(), strict=True)]
+            away += _turn(rotation, self._rotation.tolist())
+            if max(map(abs, away)) < TOLERANCE and abs(joints[2]) < 2e-3:
                 break
+            mujoco.mj_comPos(self._model, self._data)
             jacobian = self._jacobian_here()
-            inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(6))
-            back = np.zeros(7)
-            back[2] = -STRAIGHTEN * joints[2]
-            step = inverse @ (error - jacobian @ back) + back
-            joints = np.clip(joints + step * min(1.0, MAX_TURN / np.abs(step).max()), self._low, self._high)
-        return joints
+            back = -STRAIGHTEN * joints[2]
+            np.add(jacobian @ jacobian.T, self._damping, out=self._normal)
+            mujoco.mju_cholFactor(self._normal, 0.0)
+            mujoco.mju_cholSolve(self._reduced, self._normal, away - jacobian[:, 2] * back)
+            step = (self._reduced @ jacobian).tolist()
+            step[2] += back
+            scale = min(1.0, MAX_TURN / max(map(abs, step)))
+            joints = [
+                min(max(angle + scale * turn, low), high)
+                for angle, turn, (low, high) in zip(joints, step, self._limits, strict=True)
+            ]
+        return np.array(joints)
 
     def _place(self, joints: np.ndarray) -> None:
         self._data.qpos[self._qpos] = joints
@@ -67,8 +81,23 @@ class ArmKinematics:
         mujoco.mj_comPos(self._model, self._data)
 
     def _jacobian_here(self) -> np.ndarray:
-        mujoco.mj_jacSite(self._model, self._data, self._jacobian[:3], self._jacobian[3:], self._site)
+        mujoco.mj_jacSite(self._model, self._data, *self._rows, self._site)
         return self._jacobian[:, self._dofs]
+
+
+def _turn(target: list[float], here: list[float]) -> list[float]:
+    """`rotation_vector` of target @ here.T, both with 9 numbers by rows."""
+    (a, b, c), (d, e, f), (g, h, i) = target[:3], target[3:6], target[6:]
+    (j, k, m), (n, o, p), (q, r, s) = here[:3], here[3:6], here[6:]
+    x = g * n + h * o + i * p - (d * q + e * r + f * s)
+    y = a * q + b * r + c * s - (g * j + h * k + i * m)
+    z = d * j + e * k + f * m - (a * n + b * o + c * p)
+    norm = math.sqrt(x * x + y * y + z * z)
+    if norm < 1e-9:
+        return [x / 2, y / 2, z / 2]
+    trace = a * j + b * k + c * m + d * n + e * o + f * p + g * q + h * r + i * s
+    share = math.atan2(norm, trace - 1) / norm
+    return [x * share, y * share, z * share]
 
 
 def rotation_vector(rotation: np.ndarray) -> np.ndarray:

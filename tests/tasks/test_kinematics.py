@@ -65,3 +65,29 @@ def test_rotation_vectors_and_matrices_are_inverse():
         vector *= length / np.linalg.norm(vector)
         np.testing.assert_allclose(rotation_vector(rotation_matrix(vector)), vector, atol=1e-9)
     assert yaw_of(about_z(-2.5)) == pytest.approx(-2.5)
+
+
+def plainly_solved(arm: ArmKinematics, target: Pose, joints: np.ndarray) -> np.ndarray:
+    """Damped least squares, written as in the formula."""
+    low, high = np.array(arm._limits).T
+    for _ in range(30):
+        here, jacobian = arm.pose(joints), arm.jacobian(joints)
+        error = np.append(target.position - here.position, rotation_vector(target.rotation @ here.rotation.T))
+        if np.abs(error).max() < 2e-4 and abs(joints[2]) < 2e-3:
+            break
+        back = np.array([0, 0, -0.3 * joints[2], 0, 0, 0, 0])
+        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + 0.02**2 * np.eye(6))
+        step = inverse @ (error - jacobian @ back) + back
+        joints = np.clip(joints + step * min(1.0, 0.25 / np.abs(step).max()), low, high)
+    return joints
+
+
+def test_solutions_are_those_of_the_plain_formula(arm):
+    rng, home = np.random.default_rng(0), arm.pose(home_joints())
+    for _ in range(20):
+        target = Pose(
+            home.position + rng.uniform(-0.1, 0.1, 3),
+            rotation_matrix(rng.uniform(-0.6, 0.6, 3)) @ home.rotation,
+        )
+        start = home_joints() + rng.uniform(-0.2, 0.2, 7)
+        assert arm.solve(target, start) == pytest.approx(plainly_solved(arm, target, start), abs=1e-9)

@@ -11,10 +11,13 @@ import torch
 from torch import Tensor
 
 from imfvla.config.assets import install_command
-from imfvla.deployment.graphs import CHUNK, OBSERVE, OBSERVED
+from imfvla.config.protocol import FRESH
 from imfvla.errors import UserError
 from imfvla.policy import Policy
 from imfvla.types import Observation
+
+OBSERVED = ("images", "state", "instruction")  # inputs of a graph that sees
+CHUNK, OBSERVE = "chunk", "observe"  # graphs; others are calls of the core, by their names
 
 
 class OnnxPolicy:
@@ -23,12 +26,21 @@ class OnnxPolicy:
     def __init__(self, policy: Policy, nfe: int, graphs: Mapping[str, bytes], threads: int = 1) -> None:
         self.robot, self.horizon, self.views = policy.robot, policy.horizon, policy.views
         self.image_size, self.noise_shape = policy.image_size, policy.noise_shape
-        self._generator, self._chunks, self._nfe = policy.generator, policy.chunks, nfe
+        self._policy, self._nfe = policy, nfe
         self._sessions = {name: _session(graph, threads) for name, graph in graphs.items()}
 
     def eval(self) -> "OnnxPolicy":
         """Itself: graphs have no training mode."""
         return self
+
+    def to(self, device: str) -> "OnnxPolicy":
+        """Itself, on the CPU alone."""
+        assert str(device) == "cpu"
+        return self
+
+    def check_sampling(self, nfe: int, noise_scale: float, noise: str = FRESH) -> None:
+        """As `Policy.check_sampling`."""
+        self._policy.check_sampling(nfe, noise_scale, noise)
 
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         """The chunk (1, Tp, A) in physical units of one observation, as `Policy.predict` computes it."""
@@ -41,8 +53,8 @@ class OnnxPolicy:
             (chunk,) = self._sessions[CHUNK].run(None, {**observed, "noise": noise.numpy()})
             return torch.from_numpy(chunk)
         context = self._sessions[OBSERVE].run(None, observed)
-        chunk = self._generator.sample(_Core(self._sessions), context, noise, nfe)
-        return self._chunks.denormalise(chunk, obs.state[:, -1])
+        chunk = self._policy.generator.sample(_Core(self._sessions), context, noise, nfe)
+        return self._policy.chunks.denormalise(chunk, obs.state[:, -1])
 
 
 class _Core:
