@@ -21,7 +21,14 @@ from imfvla.storage.records import read_record
 from imfvla.storage.run_directory import RunDirectory
 
 FILE = "latency.json"
-OF = ("weights", "nfe", "candidates", "prefix", "device", "runtime")  # keys of a protocol that times depend on
+OF = (
+    "weights",
+    "nfe",
+    "candidates",
+    "prefix",
+    "device",
+    "runtime",
+)  # keys of a protocol that times depend on
 OLDER = {"prefix": NO_PREFIX, "runtime": EAGER}  # in files that are older than the keys
 REMEDY = "delete it; the times are then taken again"
 CALLS, FEWEST_CALLS, WARM_UP = (
