@@ -42,6 +42,10 @@ class OnnxPolicy:
         """As `Policy.check_sampling`."""
         self._policy.check_sampling(nfe, noise_scale, noise)
 
+    def check_replanning(self, nfe: int, candidates: int, prefix: str) -> None:
+        """As `Policy.check_replanning`."""
+        self._policy.check_replanning(nfe, candidates, prefix)
+
     def predict(self, obs: Observation, noise: Tensor, nfe: int) -> Tensor:
         """The chunk (1, Tp, A) in physical units of one observation, as `Policy.predict` computes it."""
         if nfe != self._nfe:
