@@ -13,6 +13,7 @@ if __name__ == "__main__":
     begin()
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,8 +44,7 @@ def export(source: Path, target: Path, views: list[str] | None) -> None:
         raise UserError(f"{source} holds no frames that all of its views share: there is nothing to show.")
     # A step that the video passes over would hide its frame.
     control_hz = episode.info.robot.control_hz
-    usual = steps_between_frames(control_hz)
-    every = usual if (np.diff(episode.image_steps) % usual == 0).all() else 1
+    every = math.gcd(steps_between_frames(control_hz), *np.diff(episode.image_steps).tolist())
     write_mp4(target, frames(episode, every), control_hz / every)
 
 

@@ -23,7 +23,7 @@ from imfvla.runtime.graphs import read_graphs
 from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.storage.run_directory import RunDirectory
 
-VIDEO_HEIGHT = 240  # of a view [px]
+VIDEO_HEIGHT = 192  # of a view [px]: twice what the policies of the tables see
 
 Build = Callable[[Path, int], tuple[Environment, Any]]  # run directory, training step -> environment, policy
 

@@ -73,9 +73,9 @@ def test_an_episode_is_filmed_in_real_time(tmp_path):
     for step in steps():
         sink.step(env, step)
     sink.end(RESULT)
-    assert asked == [("front", 24, 36), ("top", 24, 36)] * 3
+    assert asked == [("front", 24, 36), ("top", 24, 36)] * 2
     with av.open(str(tmp_path / "a.mp4")) as container:
-        assert container.streams.video[0].average_rate == 25
+        assert container.streams.video[0].average_rate == 12.5
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
 
 
