@@ -17,7 +17,7 @@ def mean(values: np.ndarray) -> Measured:
 
 
 def median(values: np.ndarray) -> Measured:
-    return _located(np.median, values)
+    return _located(middle, values)
 
 
 def interquartile_mean(values: np.ndarray) -> Measured:
@@ -100,7 +100,17 @@ def _located(statistic: Statistic, values: np.ndarray) -> Measured:
 
 def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The statistic of `interquartile_mean`."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+    ordered = np.sort(values, axis=axis)  # of whole rows, which is faster here than to find their quarters
+    cut = int(0.25 * values.shape[axis])
+    kept = np.arange(cut, values.shape[axis] - cut)
+    return np.mean(np.take(ordered, kept, axis=axis), axis=axis)
+
+
+def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The median, sorted as in `trimmed`."""
+    number = values.shape[axis]
+    ordered = np.sort(values, axis=axis)
+    return np.mean(np.take(ordered, [(number - 1) // 2, number // 2], axis=axis), axis=axis)
 
 
 def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:

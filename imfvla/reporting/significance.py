@@ -1,12 +1,14 @@
 """Two-sided tests of paired episodes, and their correction over a table."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 import scipy
 
 MOST_EXACT = 16  # pairs that differ; with more, sign flips are drawn
 FLIPS = 100_000
+MOST_KEPT = 128  # pairs whose flips are drawn once for all tests
 
 
 def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -33,9 +35,8 @@ def sign_flip(differences: np.ndarray) -> float:
     if sizes.size <= MOST_EXACT:
         bits = np.arange(2**sizes.size)[:, None] >> np.arange(sizes.size) & 1
         return float((np.abs(2 * bits @ sizes - sizes.sum()) >= least).mean())
-    rng, extreme, block = np.random.default_rng(0), 0, FLIPS // 10
-    for _ in range(10):
-        bits = rng.integers(0, 2, (block, sizes.size), dtype=np.int8)
+    extreme, block = 0, FLIPS // 10
+    for bits in _flips(sizes.size, block):
         extreme += int((np.abs(2 * (bits @ sizes) - sizes.sum()) >= least).sum())
     return (extreme + 1) / (FLIPS + 1)
 
@@ -49,6 +50,22 @@ def signed_rank(differences: np.ndarray) -> float:
     differences = np.asarray(differences, float)
     differences = differences[differences != 0]
     return sign_flip(np.sign(differences) * scipy.stats.rankdata(np.abs(differences)))
+
+
+def _flips(pairs: int, block: int) -> Iterator[np.ndarray]:
+    """The signs of all flips as 0 and 1, int8 (block, pairs) each."""
+    if pairs <= MOST_KEPT:
+        yield from _bits()[: FLIPS * pairs].reshape(-1, block, pairs)
+    else:
+        rng = np.random.default_rng(0)
+        for _ in range(FLIPS // block):
+            yield rng.integers(0, 2, (block, pairs), dtype=np.int8)
+
+
+@lru_cache(maxsize=1)
+def _bits() -> np.ndarray:
+    """Those of up to `MOST_KEPT` pairs, which all begin with the same."""
+    return np.random.default_rng(0).integers(0, 2, FLIPS * MOST_KEPT, dtype=np.int8)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
