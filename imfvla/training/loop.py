@@ -189,14 +189,15 @@ class Trainer:
             policy.begin_step(self.step, self.options.steps)
         with autocast(self.precision, self.device), self.processes.draws(rng, len(share.actions)):
             loss, logs = self.policy.loss(share, rng)
-        loss_value, *means = self.processes.mean([loss.item(), *(value.item() for value in logs.values())])
-        if not math.isfinite(loss_value):
-            return self._skip("loss", loss_value, batch)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.processes.average_gradients(self.policy.parameters())
         limit = self.clipping.limit
-        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit)).item()
+        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit))
+        *values, norm = numbers(loss, *logs.values(), norm)
+        loss_value, *means = self.processes.mean(values)
+        if not math.isfinite(loss_value):
+            return self._skip("loss", loss_value, batch)
         if not math.isfinite(norm):
             return self._skip("norm of the gradient", norm, batch)
         clipped = self.clipping.update(norm)
@@ -266,6 +267,11 @@ class Trainer:
             **self.origin.to_json(),
         }
         save_state(self.run.last_state, self.state, details, writes=self.processes.is_first)
+
+
+def numbers(*scalars: Tensor) -> list[float]:
+    """Scalars of one device as floats, read at once: an accelerator is waited for a single time in a step."""
+    return torch.stack([scalar.detach().to(torch.float64) for scalar in scalars]).tolist()
 
 
 def step_seed(seed: int, step: int) -> int:

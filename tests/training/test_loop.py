@@ -385,3 +385,21 @@ def test_cuda_without_a_device_is_refused(monkeypatch):
     assert choose_device("auto").type == "cpu"
     with pytest.raises(UserError, match=r"training\.device is cuda"):
         choose_device("cuda")
+
+
+READS = ("item", "tolist", "cpu", "numpy", "__bool__", "__float__", "__int__", "nonzero")
+
+
+def test_a_step_waits_once_for_an_accelerator(tmp_path, make_trainer, monkeypatch):
+    """On a CPU every read of a tensor's values counts, since on a GPU each of them would wait."""
+    trainer = make_trainer(tmp_path)
+    read = []
+    for name in READS:
+        was = getattr(torch.Tensor, name)
+        monkeypatch.setattr(
+            torch.Tensor, name, lambda *args, was=was, name=name: read.append(name) or was(*args)
+        )
+    batch = next(trainer.batches)
+    read.clear()
+    trainer._update(batch)
+    assert read == ["tolist"]
