@@ -25,7 +25,7 @@ from imfvla.policy.blank import blank_observation
 from imfvla.runtime.onnx_policy import CHUNK, OBSERVE, OBSERVED
 from imfvla.types import Observation
 
-MAX_STEPS = 10  # written out in one graph
+MAX_STEPS = 4  # written out in one graph; a longer one takes a minute to write and is no faster
 CALLS = {"flow": ("forward",), "flow and v-head": ("forward", "instant")}  # of the core, by its interface
 
 
