@@ -26,6 +26,20 @@ Columns = tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True, slots=True)
+class Counted:
+    """A statistic of one column that is found sooner from how often each of its numbers was drawn.
+
+    `counted` takes the column (n,) and counts (n, resamples), each resample's n in sum.
+    """
+
+    of: Callable[..., np.ndarray]
+    counted: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+    def __call__(self, values: np.ndarray, axis: int = -1) -> np.ndarray:
+        return self.of(values, axis=axis)
+
+
+@dataclass(frozen=True, slots=True)
 class Bootstrapped:
     """A statistic, its 95% interval and standard error; `freedom` is of Student's t of value / error."""
 
@@ -82,14 +96,42 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
 def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: float) -> Bootstrapped:
     """The numbers of `scipy.stats.bootstrap` with the seed 0, whose draws are here the same for every column."""
     starts = columns[0].size
-    places, block = _places(starts), max(1, NUMBERS_AT_ONCE // starts)
-    rows = (places[first : first + block] for first in range(0, RESAMPLES, block))
-    distribution = np.concatenate([statistic(*(c[drawn] for c in columns), axis=-1) for drawn in rows])
+    distribution = _distribution(statistic, columns)
     low, high = _bias_corrected(distribution, value, statistic(*map(_each_left_out, columns), axis=-1))
     if not np.isfinite([low, high]).all():
         low, high = _percentiles(distribution)
     error = float(np.std(distribution, ddof=1))
     return Bootstrapped(value, float(low), float(high), error, starts - 1)
+
+
+def _distribution(statistic: Statistic, columns: Sequence[np.ndarray]) -> np.ndarray:
+    """The statistic of each resample (resamples,)."""
+    starts = columns[0].size
+    block = max(1, NUMBERS_AT_ONCE // starts)
+    parts = [slice(first, first + block) for first in range(0, RESAMPLES, block)]
+    if isinstance(statistic, Counted) and all(map(_is_whole, columns)):
+        counts = _counts(starts)
+        return np.concatenate([statistic.counted(*columns, counts[:, part]) for part in parts])
+    places = _places(starts)
+    return np.concatenate([statistic(*(c[places[part]] for c in columns), axis=-1) for part in parts])
+
+
+def _is_whole(column: np.ndarray) -> bool:
+    """Whether sums of its numbers are exact, in any order."""
+    return bool((column == np.rint(column)).all() and np.abs(column).max() < 2**32)
+
+
+@lru_cache(maxsize=1)
+def _counts(starts: int) -> np.ndarray:
+    """How often each resample has each start, uint16 (starts, resamples)."""
+    places, block = _places(starts), max(1, NUMBERS_AT_ONCE // starts)
+    counts = np.empty((starts, RESAMPLES), np.uint16)
+    for first in range(0, RESAMPLES, block):
+        drawn = places[first : first + block].astype(np.int64)
+        drawn += starts * np.arange(len(drawn))[:, None]
+        of_block = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
+        counts[:, first : first + block] = of_block.T
+    return counts
 
 
 @lru_cache(maxsize=1)

@@ -8,21 +8,21 @@ import math
 import numpy as np
 import scipy
 
-from imfvla.reporting.bootstrap import TAILS, Statistic, bootstrap
+from imfvla.reporting.bootstrap import TAILS, Counted, Statistic, bootstrap
 from imfvla.reporting.measured import Measured
 
 
 def mean(values: np.ndarray) -> Measured:
-    return _located(np.mean, values)
+    return _located(MEAN, values)
 
 
 def median(values: np.ndarray) -> Measured:
-    return _located(middle, values)
+    return _located(MEDIAN, values)
 
 
 def interquartile_mean(values: np.ndarray) -> Measured:
     """Mean without the lowest and the highest quarter, each rounded down (R. Agarwal et al., arXiv:2108.13264)."""
-    return _located(trimmed, values)
+    return _located(INTERQUARTILE_MEAN, values)
 
 
 def pooled_mean(totals: np.ndarray, counts: np.ndarray) -> Measured:
@@ -111,6 +111,37 @@ def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
     number = values.shape[axis]
     ordered = np.sort(values, axis=axis)
     return np.mean(np.take(ordered, [(number - 1) // 2, number // 2], axis=axis), axis=axis)
+
+
+def _counted_mean(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    return column @ counts / column.size
+
+
+def _counted_median(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    ordered, reached = _cumulated(column, counts)
+    number = column.size
+    ends = ((reached <= place).sum(axis=0) for place in ((number - 1) // 2, number // 2))
+    return np.mean([ordered[end] for end in ends], axis=0)
+
+
+def _counted_trimmed(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    ordered, reached = _cumulated(column, counts)
+    cut = int(0.25 * column.size)
+    kept = np.clip(reached, cut, column.size - cut)
+    weights = np.diff(kept, axis=0, prepend=np.full((1, kept.shape[1]), cut, kept.dtype))
+    return ordered @ weights / (column.size - 2 * cut)
+
+
+def _cumulated(column: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The column ascending, and how many of each resample are there or before: (n,), (n, resamples)."""
+    order = np.argsort(column)
+    small = np.uint16 if column.size < 2**16 else np.int64
+    return column[order], np.cumsum(counts[order], axis=0, dtype=small)
+
+
+MEAN = Counted(np.mean, _counted_mean)
+MEDIAN = Counted(middle, _counted_median)
+INTERQUARTILE_MEAN = Counted(trimmed, _counted_trimmed)
 
 
 def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:

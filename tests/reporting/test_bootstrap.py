@@ -6,6 +6,7 @@ from scipy import stats
 
 from imfvla.reporting import bootstrap as module
 from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
+from imfvla.reporting.estimates import INTERQUARTILE_MEAN, MEAN, MEDIAN
 
 SKEWED = np.array([10, 12, 12.5, 12.5, 13.9, 15, 21, 22, 23, 34, 50, 81, 89, 121, 134, 213])
 
@@ -126,3 +127,15 @@ def test_a_hierarchical_bootstrap_in_blocks_is_the_same_bootstrap(monkeypatch):
     whole = bootstrap(np.mean, values)
     monkeypatch.setattr(module, "NUMBERS_AT_ONCE", 7000)
     assert bootstrap(np.mean, values).error == pytest.approx(whole.error, rel=0.03)
+
+
+@pytest.mark.parametrize("number", [16, 101])
+@pytest.mark.parametrize("statistic", [MEAN, MEDIAN, INTERQUARTILE_MEAN])
+def test_counting_what_was_drawn_gives_the_same_numbers(statistic, number):
+    values = np.random.default_rng(number).integers(0, 40, number)
+    assert bootstrap(statistic, values) == bootstrap(statistic.of, values)
+
+
+def test_numbers_that_are_not_whole_are_not_counted(monkeypatch):
+    monkeypatch.setattr(module, "_counts", None)
+    assert bootstrap(MEDIAN, SKEWED) == bootstrap(np.median, SKEWED)
