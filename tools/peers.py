@@ -1,10 +1,10 @@
 """Our ACT beside LeRobot's, of the same sizes, on the same machine and in turn: processor time of a step and a chunk.
 
-python tools/peers.py                                       # LeRobot from .venvs/lerobot
-python tools/peers.py --python PATH scale=cpu observation.image_size=[224,224]    # overrides of our +exp=socket_act
+python tools/peers.py                            # LeRobot from .venvs/lerobot
+python tools/peers.py --python PATH scale=paper      # overrides of our +exp=socket_act
 
-Our policy has the encoder of its config, which makes fewer tokens of a picture than LeRobot's grid; the table says how
-many parameters each has. Where LeRobot is missing, the reason is printed and nothing is measured.
+Both have a ResNet-18, of whose features LeRobot makes a token each and ours four a picture. Where LeRobot is missing,
+the reason is printed and nothing is measured.
 """
 
 from imfvla.command import as_command, begin
@@ -37,6 +37,7 @@ from imfvla.types import Batch, Observation
 USUAL = Path(".venvs/lerobot/bin/python")
 RIVAL = Path(__file__).with_name("rivals") / "lerobot_act.py"
 CALLS = ("train", "predict")
+OURS = ("+exp=socket_act", "encoder=resnet18")  # LeRobot's encoder is a ResNet-18 as well
 FILL = "python3.12 -m venv .venvs/lerobot && .venvs/lerobot/bin/pip install lerobot"
 
 
@@ -140,7 +141,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("overrides", nargs="*", help="of +exp=socket_act, such as scale=paper")
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    config = compose("train", ["+exp=socket_act", *options.overrides])
+    config = compose("train", [*OURS, *options.overrides])
     policy = build_unfitted(config)
     try:
         rival = Rival(options.python, sizes_of(config, policy, options.batch, options.threads))

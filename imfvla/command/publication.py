@@ -17,6 +17,7 @@ from imfvla.figures.overview import method_overview
 from imfvla.figures.reward_latency import reward_latency
 from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.figures.style import render
+from imfvla.process.progress import Progress
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import COMPARISONS, SETTINGS, TableTitle
@@ -101,7 +102,11 @@ def publish(
         )
     measured = [table for table in mapping.tables if _is_measured(table, mapping, results)]
     left_out = [table for table in mapping.tables if table not in measured]
-    documents = {table.name: _document(table, mapping, results) for table in mapping.tables}
+    documents = {}
+    with Progress("tables", len(mapping.tables)) as bar:
+        for table in mapping.tables:
+            documents[table.name] = _document(table, mapping, results)
+            bar.advance(table.name)
     documents["others"] = other_table(others)
     if offline:
         documents["offline"] = offline_table(offline)
@@ -214,7 +219,12 @@ def _figures(
             "What the sublayers of trained policies read: mean Attention Residual weights over the action tokens.",
         ),
     }
-    return {name: (caption, render(figure)) for name, (figure, caption) in drawn.items()}
+    rendered = {}
+    with Progress("figures", len(drawn)) as bar:
+        for name, (figure, caption) in drawn.items():
+            rendered[name] = (caption, render(figure))
+            bar.advance(name)
+    return rendered
 
 
 def _depth_attention(results: Sequence[Result]) -> list[dict[str, Any]]:

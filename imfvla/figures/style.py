@@ -61,8 +61,10 @@ def render(figure: Figure) -> dict[str, bytes]:
     for text in figure.findobj(Text):
         text.set_text(visible(text.get_text(), keep="\n"))  # XML takes no control characters
     with style():
-        figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # the layout is computed: it need not be repeated for each format
+        # Computed once, without a drawing of its own; with any engine left, savefig would draw once more for it.
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
+        figure.set_layout_engine(None)
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
         stream = io.BytesIO()
         with style():

@@ -85,7 +85,8 @@ class Sources:
         last = {
             other.nfe
             for other in mapping.rows
-            if (other.experiment, other.run, other.checkpoint) == (row.experiment, row.run, LAST)
+            if (other.experiment, other.checkpoint) == (row.experiment, LAST)
+            and other.run == row.run
             and not other.changes
         }
         overrides = "".join(f" {override}" for override in row.overrides)
@@ -136,8 +137,9 @@ def check_equal_protocols(answers: Sequence[Answer], task: str) -> None:
 
 def _is_of(evaluation: Evaluation, row: TableRow) -> bool:
     """Whether it is of the row's policy, weights and NFE, with its noise, clock and condition."""
-    policy = (evaluation.experiment, evaluation.key, evaluation.nfe)
-    if policy != (row.experiment, row.run, row.nfe) or evaluation.changes != dict(row.changes):
+    if (evaluation.experiment, evaluation.nfe) != (row.experiment, row.nfe):  # first what is found at once
+        return False
+    if evaluation.key != row.run or evaluation.changes != dict(row.changes):
         return False
     return evaluation.summary["checkpoint_step"] == row.step(evaluation.training_steps)
 

@@ -1,6 +1,7 @@
 """A row of the tables: the policy, its weights and the evaluation that answer it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from imfvla.reporting.paper import PaperRow
@@ -40,7 +41,7 @@ class TableRow:
     @property
     def run(self) -> str:
         """Name of the run directory below that of the experiment, its seed apart; "" for "default"."""
-        return run_key(run_name(self.overrides))
+        return _run_of(self.overrides)
 
     @property
     def label(self) -> str:
@@ -54,3 +55,9 @@ class TableRow:
     def step(self, steps: int) -> int:
         """The step of the row's weights in a training of so many steps."""
         return step_of(steps, self.checkpoint)
+
+
+@lru_cache(maxsize=4096)
+def _run_of(overrides: tuple[str, ...]) -> str:
+    """Kept, since every row is compared with every evaluation."""
+    return run_key(run_name(overrides))
