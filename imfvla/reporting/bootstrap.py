@@ -82,21 +82,37 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
         raise ValueError(
             f"The columns must have the same starts, found {[column.shape for column in columns]}."
         )
+    return _found(statistic, tuple(tuple(map(_kept, columns)) for columns in policies), RESAMPLES)
+
+
+Kept = tuple[tuple[int, ...], bytes]  # shape and content of a column
+
+
+def _kept(column: np.ndarray) -> Kept:
+    return column.shape, column.tobytes()
+
+
+@lru_cache(maxsize=1024)  # a row's numbers are asked for by tables, figures and the row's other numbers
+def _found(statistic: Statistic, kept: tuple[tuple[Kept, ...], ...], resamples: int) -> Bootstrapped:
+    policies = [tuple(np.frombuffer(held).reshape(shape) for shape, held in columns) for columns in kept]
+    columns = [column for columns in policies for column in columns]
     with np.errstate(all="ignore"):
         value = float(statistic(*(column.ravel() for column in columns), axis=-1))
-        if min(lengths) < FEWEST_STARTS or not np.isfinite(value):
+        if columns[0].shape[1] < FEWEST_STARTS or not np.isfinite(value):
             return Bootstrapped(value)
         if all(np.ptp(column) == 0 for column in columns):
             return Bootstrapped(value, value, value, 0.0)
         if max(map(len, columns)) > 1:
-            return _hierarchical(statistic, policies, value)
-        return _accelerated(statistic, [column[0] for column in columns], value)
+            return _hierarchical(statistic, policies, value, resamples)
+        return _accelerated(statistic, [column[0] for column in columns], value, resamples)
 
 
-def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: float) -> Bootstrapped:
+def _accelerated(
+    statistic: Statistic, columns: Sequence[np.ndarray], value: float, resamples: int
+) -> Bootstrapped:
     """The numbers of `scipy.stats.bootstrap` with the seed 0, whose draws are here the same for every column."""
     starts = columns[0].size
-    distribution = _distribution(statistic, columns)
+    distribution = _distribution(statistic, columns, resamples)
     low, high = _bias_corrected(distribution, value, statistic(*map(_each_left_out, columns), axis=-1))
     if not np.isfinite([low, high]).all():
         low, high = _percentiles(distribution)
@@ -104,15 +120,15 @@ def _accelerated(statistic: Statistic, columns: Sequence[np.ndarray], value: flo
     return Bootstrapped(value, float(low), float(high), error, starts - 1)
 
 
-def _distribution(statistic: Statistic, columns: Sequence[np.ndarray]) -> np.ndarray:
+def _distribution(statistic: Statistic, columns: Sequence[np.ndarray], resamples: int) -> np.ndarray:
     """The statistic of each resample (resamples,)."""
     starts = columns[0].size
     block = max(1, NUMBERS_AT_ONCE // starts)
-    parts = [slice(first, first + block) for first in range(0, RESAMPLES, block)]
+    parts = [slice(first, first + block) for first in range(0, resamples, block)]
     if isinstance(statistic, Counted) and all(map(_is_whole, columns)):
-        counts = _counts(starts)
+        counts = _counts(starts, resamples)
         return np.concatenate([statistic.counted(*columns, counts[:, part]) for part in parts])
-    places = _places(starts)
+    places = _places(starts, resamples)
     return np.concatenate([statistic(*(c[places[part]] for c in columns), axis=-1) for part in parts])
 
 
@@ -122,11 +138,11 @@ def _is_whole(column: np.ndarray) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _counts(starts: int) -> np.ndarray:
+def _counts(starts: int, resamples: int) -> np.ndarray:
     """How often each resample has each start, uint16 (starts, resamples)."""
-    places, block = _places(starts), max(1, NUMBERS_AT_ONCE // starts)
-    counts = np.empty((starts, RESAMPLES), np.uint16)
-    for first in range(0, RESAMPLES, block):
+    places, block = _places(starts, resamples), max(1, NUMBERS_AT_ONCE // starts)
+    counts = np.empty((starts, resamples), np.uint16)
+    for first in range(0, resamples, block):
         drawn = places[first : first + block].astype(np.int64)
         drawn += starts * np.arange(len(drawn))[:, None]
         of_block = np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape)
@@ -135,11 +151,11 @@ def _counts(starts: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _places(starts: int) -> np.ndarray:
+def _places(starts: int, resamples: int) -> np.ndarray:
     """The starts of each resample, int32 (resamples, starts)."""
     rng, block = np.random.default_rng(0), max(1, NUMBERS_AT_ONCE // starts)
-    places = np.empty((RESAMPLES, starts), np.int32)
-    for first in range(0, RESAMPLES, block):
+    places = np.empty((resamples, starts), np.int32)
+    for first in range(0, resamples, block):
         rows = places[first : first + block]
         rows[:] = rng.integers(0, starts, rows.shape)
     return places
@@ -175,7 +191,9 @@ def _quantiles(distribution: np.ndarray, shares: np.ndarray) -> np.ndarray:
     return (1 - part) * ordered[at[0]] + part * ordered[at[1]]
 
 
-def _hierarchical(statistic: Statistic, policies: Sequence[Columns], value: float) -> Bootstrapped:
+def _hierarchical(
+    statistic: Statistic, policies: Sequence[Columns], value: float, resamples: int
+) -> Bootstrapped:
     """Starts and each policy's training seeds are drawn independently, since every seed met the same starts.
 
     That is the pigeonhole bootstrap (A. Owen, Ann. Appl. Stat. 1, 2007). Of S seeds S - 1 are drawn, which makes the
@@ -187,7 +205,7 @@ def _hierarchical(statistic: Statistic, policies: Sequence[Columns], value: floa
     starts, counts = policies[0][0].shape[1], [len(columns[0]) for columns in policies]
     rng = np.random.default_rng(0)
     several, none = [count > 1 for count in counts], [False] * len(policies)
-    both = _drawn(statistic, policies, rng, RESAMPLES, over_seeds=several, over_starts=True)
+    both = _drawn(statistic, policies, rng, resamples, over_seeds=several, over_starts=True)
     drawn = _drawn(statistic, policies, rng, RESAMPLES_OF_PARTS, over_seeds=none, over_starts=True)
     parts = [(np.var(drawn), starts - 1)]
     for policy, count in enumerate(counts):
