@@ -62,7 +62,7 @@ def render(figure: Figure) -> dict[str, bytes]:
         text.set_text(visible(text.get_text(), keep="\n"))  # XML takes no control characters
     with style():
         # Computed once, without a drawing of its own; with any engine left, savefig would draw once more for it.
-        if (engine := figure.get_layout_engine()) is not None:
+        if figure.axes and (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
         figure.set_layout_engine(None)
     for suffix, metadata in ((".svg", {"Date": None, "Creator": None}), (".png", {"Software": None})):
