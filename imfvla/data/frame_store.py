@@ -21,7 +21,7 @@ from imfvla.data.checksums import checked_sums, digest_of, remember, with_checks
 from imfvla.data.resample import resample
 from imfvla.errors import UserError
 from imfvla.options import at_most, of_length, within, within_length
-from imfvla.robot import MAX_CAMERAS, MAX_SIDE
+from imfvla.robot import MAX_CAMERAS, MAX_CHANNELS, MAX_SIDE
 from imfvla.sources.base import EpisodeArrays, EpisodeSource
 from imfvla.sources.validation import check_episode
 from imfvla.storage.documents import read_json
@@ -31,6 +31,7 @@ from imfvla.storage.records import read_record
 
 FORMAT = 2
 IMAGES = "images.raw"
+MAX_NPY_HEADER = 4096  # bytes, of an array's shape and type
 ARRAYS = (IMAGES, "image_steps.npy", "state.npy", "action.npy")
 FILES = {*ARRAYS, "meta.json"}
 NUM_DECODERS = 2  # threads: decompression, decoding and checksums run outside the interpreter lock
@@ -98,18 +99,14 @@ class FrameStore:
             meta = read_record(path / "meta.json", StoreMeta, "delete the store")
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
+            _check_sizes(path, meta)  # before files of terabytes are read
+            sums = checked_sums(path, meta, ARRAYS)
+            content = {name: digest_of(sums[name]) for name in ARRAYS}
+            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
             images = _mapped(path / IMAGES, np.uint8, shape)
-            rows, frames = (
-                sum(entry[key] for entry in meta["episodes"]) for key in ("num_steps", "num_frames")
-            )
-            if not len(state) == len(action) == rows or len(image_steps) != frames:
-                raise ValueError("its arrays differ in length")
-            sums = checked_sums(path, meta, ARRAYS)  # of whole files, which are as long as they should be
-            content = {name: digest_of(sums[name]) for name in ARRAYS}
-            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             episodes, row, frame = [], 0, 0
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
@@ -118,6 +115,8 @@ class FrameStore:
                 entry["instructions"] = known.setdefault(instructions, instructions)
                 episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
                 row, frame = row + entry["num_steps"], frame + len(steps)
+            if not len(state) == len(action) == row or len(image_steps) != frame:
+                raise ValueError("its arrays differ in length")
             _check_arrays(state, action, image_steps, episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(
@@ -154,6 +153,21 @@ class FrameStore:
             if not _is_current(store_path, meta):
                 _write(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
+
+
+def _check_sizes(path: Path, meta: Mapping[str, Any]) -> None:
+    """Raises ValueError where a file is larger than the episodes of meta.json allow."""
+    rows, frames = (sum(entry[key] for entry in meta["episodes"]) for key in ("num_steps", "num_frames"))
+    numbers = MAX_NPY_HEADER + rows * MAX_CHANNELS * np.dtype(np.float32).itemsize
+    most = {
+        IMAGES: frames * len(meta["views"]) * 3 * math.prod(meta["image_size"]),
+        "image_steps.npy": MAX_NPY_HEADER + frames * np.dtype(np.int64).itemsize,
+        "state.npy": numbers,
+        "action.npy": numbers,
+    }
+    for name, size in most.items():
+        if (found := (path / name).stat().st_size) > size:
+            raise ValueError(f"{name} has {found} bytes, wanted at most {size}")
 
 
 def _check_arrays(
