@@ -15,10 +15,13 @@ from imfvla.data.checksums import checked_sums, digest_of
 from imfvla.data.store_format import ARRAYS, FORMAT, IMAGES, StoreMeta, is_made_from, meta_of
 from imfvla.data.store_writing import Progress, write_store
 from imfvla.errors import UserError
+from imfvla.robot import MAX_CHANNELS
 from imfvla.sources.base import EpisodeSource
 from imfvla.storage.files import clear_folder, locked
 from imfvla.storage.opening import ARRAY, checked
 from imfvla.storage.records import read_record
+
+MAX_NPY_HEADER = 4096  # bytes, of an array's shape and type
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +64,14 @@ class FrameStore:
             meta = read_record(path / "meta.json", StoreMeta, "delete the store")
             if meta["format"] != FORMAT:
                 raise ValueError(f"format {meta['format']}, wanted {FORMAT}")
+            _check_sizes(path, meta)  # before files of terabytes are read
+            sums = checked_sums(path, meta, ARRAYS)
+            content = {name: digest_of(sums[name]) for name in ARRAYS}
+            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             image_steps = _load(path / "image_steps.npy")
             state, action = _load(path / "state.npy"), _load(path / "action.npy")
             shape = (len(image_steps), len(meta["views"]), 3, *meta["image_size"])
             images = _mapped(path / IMAGES, np.uint8, shape)
-            rows, frames = (
-                sum(entry[key] for entry in meta["episodes"]) for key in ("num_steps", "num_frames")
-            )
-            if not len(state) == len(action) == rows or len(image_steps) != frames:
-                raise ValueError("its arrays differ in length")
-            sums = checked_sums(path, meta, ARRAYS)  # of whole files, which are as long as they should be
-            content = {name: digest_of(sums[name]) for name in ARRAYS}
-            content |= {"episodes": _digest_of_episodes(meta), "demonstrations": str(meta["digest"])}
             episodes, row, frame = [], 0, 0
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
@@ -81,6 +80,8 @@ class FrameStore:
                 entry["instructions"] = known.setdefault(instructions, instructions)
                 episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
                 row, frame = row + entry["num_steps"], frame + len(steps)
+            if not len(state) == len(action) == row or len(image_steps) != frame:
+                raise ValueError("its arrays differ in length")
             _check_arrays(state, action, image_steps, episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(
@@ -124,6 +125,21 @@ class FrameStore:
             if not is_made_from(store_path, meta):
                 write_store(source, store_path, meta, progress or (lambda done, total: None))
             return cls.open(store_path)
+
+
+def _check_sizes(path: Path, meta: Mapping[str, Any]) -> None:
+    """Raises ValueError where a file is larger than the episodes of meta.json allow."""
+    rows, frames = (sum(entry[key] for entry in meta["episodes"]) for key in ("num_steps", "num_frames"))
+    numbers = MAX_NPY_HEADER + rows * MAX_CHANNELS * np.dtype(np.float32).itemsize
+    most = {
+        IMAGES: frames * len(meta["views"]) * 3 * math.prod(meta["image_size"]),
+        "image_steps.npy": MAX_NPY_HEADER + frames * np.dtype(np.int64).itemsize,
+        "state.npy": numbers,
+        "action.npy": numbers,
+    }
+    for name, size in most.items():
+        if (found := (path / name).stat().st_size) > size:
+            raise ValueError(f"{name} has {found} bytes, wanted at most {size}")
 
 
 def _check_arrays(

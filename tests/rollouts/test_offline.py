@@ -55,7 +55,7 @@ def run(tmp_path, monkeypatch) -> RunDirectory:
 
 
 def settings(tmp_path, *overrides: str) -> dict:
-    return configured(ROBOT, "demos.path=none", f"demos.frames_directory={tmp_path}/frames", *overrides)
+    return configured("demos.path=none", f"demos.frames_directory={tmp_path}/frames", *overrides)
 
 
 def test_a_run_ends_with_errors_in_physical_units(run, tmp_path, capsys):

@@ -15,6 +15,7 @@ from imfvla.sources.checks import (
     read_errors_told,
     shortened,
 )
+from imfvla.sources.lerobot.footer import num_values
 from imfvla.sources.lerobot.layout import DOWNLOAD, INFO, TASKS, Info
 from imfvla.storage.opening import ANYWHERE, DATA, checked
 
@@ -148,13 +149,13 @@ def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -
                 "choose features that it has",
             )
         last = file.metadata.num_rows if count is None else first + count
-        row, groups, skip = 0, [], first
+        row, groups, skip, counts = 0, [], first, num_values(path)
         for group in range(file.num_row_groups):
             num_rows = file.metadata.row_group(group).num_rows
             if row < last and row + num_rows > first:
                 skip = skip if groups else first - row
                 groups.append(group)
-                _check_group(file.metadata.row_group(group), columns, path)
+                _check_group(counts[group], columns, path)
             row += num_rows
         left, num_bytes = last - first, 0
         for batch in file.iter_batches(BATCH, row_groups=groups, columns=list(columns), use_threads=False):
@@ -170,16 +171,13 @@ def batches(path: Path, columns: Sequence[str], first: int, count: int | None) -
                 return
 
 
-def _check_group(group: pq.RowGroupMetaData, columns: Sequence[str], path: Path) -> None:
+def _check_group(counts: Sequence[tuple[str, int]], columns: Sequence[str], path: Path) -> None:
     """Raises UserError where a column would fill the memory when it is unpacked."""
-    for number in range(group.num_columns):
-        column = group.column(number)
-        name = next((name for name in columns if f"{column.path_in_schema}.".startswith(f"{name}.")), None)
-        if name is not None and column.num_values > MAX_GROUP_VALUES:
+    for column, count in counts:
+        name = next((name for name in columns if f"{column}.".startswith(f"{name}.")), None)
+        if name is not None and count > MAX_GROUP_VALUES:
             wanted = f"at most {MAX_GROUP_VALUES} values in a row group"
-            raise misfit(
-                path, f"column {name}", wanted, column.num_values, "rewrite the file in smaller row groups"
-            )
+            raise misfit(path, f"column {name}", wanted, count, "rewrite the file in smaller row groups")
 
 
 def vectors(table: pa.Table, name: str, width: int, path: Path) -> np.ndarray:
