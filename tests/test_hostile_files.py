@@ -48,14 +48,17 @@ def targets(fuzz, tmp_path_factory):
 
 
 READERS = (
-    "mcap", "mcap_index", "state", "weights", "pretrained", "config", "status", "summary", "episodes", "partial",
+    "mcap", "mcap_index", "state", "weights", "pretrained", "config", "status", "latency", "made_by",
+    "overrides", "collected", "summary", "episodes", "partial",
     "metrics", "curve", "depth_attention", "store_meta", "store_array", "options", "tables",
 )  # fmt: skip
 WITH_EXTRAS = (
-    "lerobot_info", "lerobot_stats", "lerobot_tasks", "lerobot_data", "lerobot_rows", "lerobot_video", "ros2", "hdf5",
+    "lerobot_info", "lerobot_stats", "lerobot_tasks", "lerobot_data", "lerobot_rows", "lerobot_video",
+    "lerobot_robot", "ros2", "hdf5",
 )  # fmt: skip
 CONSUMERS = (
-    "report_summary", "report_episodes", "report_config", "report_metrics", "report_depth_attention", "report_offline",
+    "report_summary", "report_episodes", "report_config", "report_metrics", "report_depth_attention",
+    "settings_running", "settings_bump", "report_offline",
     "compare_summary", "compare_episodes", "evaluate_config", "evaluate_summary", "evaluate_partial", "resume_state",
     "resume_metrics", "mcap_check", "mcap_to_mp4",
 )  # fmt: skip
