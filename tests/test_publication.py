@@ -204,4 +204,5 @@ if __name__ == "__main__":
         for path, content in make_tables().items():
             if path.stem in STEMS:
                 write_together({EXPECTED / path.name: content})
+                print(EXPECTED / path.name)
     runpy.run_path(str(EXPECTED.parent / "reporting" / "test_table_row.py"), run_name="__main__")

@@ -150,8 +150,10 @@ def ancestral_noise(noise: Tensor, count: int) -> Tensor:
     """Noise (count, B, H, A) of the later steps, a pure function of the initial noise (B, H, A).
 
     Each row has its own generator, seeded with the BLAKE2b digest (8 bytes) of the row's float32 bytes, so that a chunk
-    does not depend on the batch that it is sampled in.
+    does not depend on the batch that it is sampled in. Without later steps nothing is drawn.
     """
+    if not count:
+        return noise.new_empty((0, *noise.shape))
     rows = []
     for row in noise.detach().to("cpu", torch.float32):
         digest = hashlib.blake2b(np.ascontiguousarray(row.numpy()).tobytes(), digest_size=8).digest()

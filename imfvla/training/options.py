@@ -31,9 +31,8 @@ class TrainingOptions:
     on_non_finite: Annotated[str, one_of("stop", "skip")]  # at a batch whose loss or gradient is not finite
 
     def __post_init__(self) -> None:
-        require(
-            self.checkpoints <= self.steps, "training.checkpoints", f"at most {self.steps}", self.checkpoints
-        )
+        wanted = f"at most {self.steps}, which is training.steps"
+        require(self.checkpoints <= self.steps, "training.checkpoints", wanted, self.checkpoints)
 
     def checkpoint_steps(self) -> frozenset[int]:
         """Steps after which weights are kept: evenly spaced, the last step among them."""

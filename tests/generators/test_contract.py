@@ -215,7 +215,7 @@ def test_what_is_drawn_besides_the_initial_noise_is_told(name):
         draws = Draws()
         with torch.inference_mode(), draws:
             generator.sample(core, core.condition(context), torch.zeros(BATCH, STEPS, CHANNELS), nfe)
-        assert bool(draws.count) == draws_noise(generator, nfe)
+        assert bool(draws.count) == draws_noise(generator, nfe), f"{name}, nfe {nfe}: {draws.count} draws"
 
 
 @pytest.mark.parametrize("times", TIMES)
