@@ -120,7 +120,7 @@ def test_a_film_has_the_robots_rate_and_all_cameras_in_proportion(world, tmp_pat
     with av.open(str(tmp_path / "a.mp4")) as film:
         (stream,) = film.streams.video
         frames = sum(1 for _ in film.decode(stream))
-        assert stream.average_rate == {10: 10, 50: 25}[world.robot.control_hz]
+        assert stream.average_rate == {10: 10, 50: 12.5}[world.robot.control_hz]
         assert frames / stream.average_rate == pytest.approx(40 / world.robot.control_hz)
 
 

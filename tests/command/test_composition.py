@@ -70,7 +70,7 @@ def test_gives_plain_values():
     config = compose("train", ["horizon.pred=8", "horizon.exec=4"])
     assert type(config) is type(config["horizon"]) is dict
     assert type(config["observation"]["views"]) is list
-    assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4, "ensemble": None}
+    assert config["horizon"] == {"obs": 1, "pred": 8, "exec": 4, "ensemble": None, "prefix_max": 0}
 
 
 def test_command_line_wins_over_experiment_over_scale():

@@ -12,7 +12,7 @@ def test_help_says_what_the_command_does_and_lists_groups_and_keys(capsys):
     text = printed(train, capsys=capsys)
     assert text.startswith("python -m imfvla.train +exp=NAME: collects what is missing")
     assert "\ngenerator: act, ddpm, flow" in text
-    assert "\n+exp: aloha_transfer_act, " in text
+    assert "\n+exp: aloha_insertion_act, " in text
     assert "\nseed: 0\n" in text
     assert "\nhydra" not in text
     assert max(map(len, text.split("Keys,")[0].splitlines())) <= 110

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_every_video_plays_and_every_link_leads_into_the_folder(tab, page_file):
     )
     assert played == [240] * (3 * 4)
     links = tab.run("[...document.querySelectorAll('a')].map((link) => link.getAttribute('href'))")
-    files = {link for link in links if not link.startswith("#")}
+    files = {unquote(link) for link in links if not link.startswith("#")}
     assert all(link.startswith("media/") and (page_file.parent / link).is_file() for link in files)
     assert sum(link.endswith(".mcap") for link in files) == 3 * 4
     assert tab.errors == []
