@@ -90,7 +90,7 @@ def our_calls(config: Mapping[str, Any], policy: Policy, batch: int) -> dict[str
 
 
 class Rival:
-    """LeRobot's ACT in a process of its own. Raises UserError where it cannot be had."""
+    """LeRobot's ACT in a process of its own. Raises UserError where it is not installed."""
 
     def __init__(self, python: Path, sizes: Mapping[str, Any]) -> None:
         if not python.exists():

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imfvla.errors import UserError
+from imfvla.options import is_whole
 
 MAX_STEPS = 1000  # more than an episode has
 
@@ -31,21 +32,8 @@ class Horizon:
 
     def __post_init__(self) -> None:
         for name in ("obs", "pred", "exec"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_STEPS:
-                raise UserError(
-                    f"horizon.{name} must be a whole number between 1 and {MAX_STEPS}, found {value!r}."
-                )
-        longest = self.pred - 1
-        if (
-            isinstance(self.prefix_max, bool)
-            or not isinstance(self.prefix_max, int)
-            or not 0 <= self.prefix_max <= longest
-        ):
-            raise UserError(
-                f"horizon.prefix_max must be a whole number between 0 and {longest}, horizon.pred - 1, found "
-                f"{self.prefix_max!r}."
-            )
+            self._check(name, 1, MAX_STEPS)
+        self._check("prefix_max", 0, self.pred - 1, ", horizon.pred - 1,")
         if self.exec > self.pred:
             raise UserError(
                 f"horizon.exec must not exceed horizon.pred: only predicted actions can be executed, "
@@ -55,6 +43,13 @@ class Horizon:
             raise UserError(
                 f"horizon.ensemble averages the chunks of all steps and needs horizon.exec=1 and a decay of at least "
                 f"0, found exec={self.exec} and ensemble={self.ensemble}; set horizon.exec=1 or horizon.ensemble=null."
+            )
+
+    def _check(self, name: str, least: int, most: int, which: str = ",") -> None:
+        value = getattr(self, name)
+        if not is_whole(value) or not least <= value <= most:
+            raise UserError(
+                f"horizon.{name} must be a whole number between {least} and {most}{which} found {value!r}."
             )
 
     def observed_steps(self, step: int | np.ndarray) -> np.ndarray:

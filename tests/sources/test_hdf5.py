@@ -253,7 +253,7 @@ def test_options_that_do_not_fit_are_refused_by_key(tmp_path, changes, words):
     ],
 )  # fmt: skip
 def test_keys_and_shapes_of_every_episode_are_checked_before_one_is_read(tmp_path, damage, words):
-    """So that a training, which opens its source first, has not begun."""
+    """A training opens its source first, so nothing is trained yet."""
     path = write_robomimic(tmp_path / "demo.hdf5")
     damage(path)
     with pytest.raises(UserError) as error:
