@@ -89,8 +89,8 @@ def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
 
 
 def _experiment(result: Result) -> str:
-    return result.evaluated[0].evaluation.experiment
+    return result.first.experiment
 
 
 def _policy(line: Line) -> tuple[str, str]:
-    return policy_of(line[0].evaluated[0].evaluation)
+    return policy_of(line[0].first)

@@ -32,7 +32,7 @@ def policy_of(evaluation: Evaluation) -> tuple[str, str]:
 
 def result_name(result: Result) -> str:
     """The policy of a result; of a row of the tables the method that the table names, with its weights' share."""
-    evaluation = result.evaluated[0].evaluation
+    evaluation = result.first
     name, change = policy_of(evaluation)
     if result.row and not _is_shared(result.row):
         name = result.row.method

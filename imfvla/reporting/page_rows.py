@@ -63,7 +63,7 @@ def _videos(found: Evaluated, media: Media) -> list[str]:
 
 def _config(result: Result) -> dict[str, str]:
     """Key to value as text, of the first of several training seeds."""
-    evaluation = result.evaluated[0].evaluation
+    evaluation = result.first
     values = flatten(evaluation.config) | {
         f"evaluated: {key}": value for key, value in evaluation.summary["protocol"].items()
     }

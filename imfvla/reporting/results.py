@@ -10,6 +10,7 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.records import Row
+from imfvla.reporting.runs import Evaluation
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 
@@ -43,27 +44,31 @@ class Result:
         return not self.evaluated
 
     @property
+    def first(self) -> Evaluation:
+        """The evaluation of the first training seed."""
+        return self.evaluated[0].evaluation
+
+    @property
     def name(self) -> str:
         """Short, and unique in a report."""
         if self.row:
             return self.row.name
-        evaluation = self.evaluated[0].evaluation
-        return f"{self.policy}, infer{self.nfe}, step {evaluation.summary['checkpoint_step']}"
+        return f"{self.policy}, infer{self.nfe}, step {self.first.summary['checkpoint_step']}"
 
     @property
     def policy(self) -> str:
         """Experiment and overrides, the training seed apart, and the noise where it is unusual."""
         if self.row:
             return f"{self.row.experiment}/{self.row.run}" if self.row.run else self.row.experiment
-        return self.evaluated[0].evaluation.label
+        return self.first.label
 
     @property
     def nfe(self) -> int:
-        return self.row.nfe if self.row else self.evaluated[0].evaluation.nfe
+        return self.row.nfe if self.row else self.first.nfe
 
     @property
     def task(self) -> str | None:
-        return self.evaluated[0].evaluation.summary["protocol"]["task"] if self.evaluated else None
+        return self.first.summary["protocol"]["task"] if self.evaluated else None
 
     @property
     def is_last(self) -> bool:

@@ -96,7 +96,7 @@ def test_only_an_evaluation_in_that_setting_answers(results):
     assert [result.is_missing for result in results] == [False, False, False, True, False, True]
     assert "clock=running delay_ms=120 meanwhile=continue" in results[3].answer.command
     assert "condition=bump condition.severity=2" in results[5].answer.command
-    assert len({result.evaluated[0].evaluation.folder for result in results if not result.is_missing}) == 4
+    assert len({result.first.folder for result in results if not result.is_missing}) == 4
 
 
 def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
@@ -120,9 +120,9 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
 
 
 def test_cells_lead_to_their_rows_and_rows_show_their_videos(results, tmp_path):
-    folder = results[2].evaluated[0].evaluation.folder
+    folder = results[2].first.folder
     (folder / "best_seed1.mp4").write_bytes(b"")
-    results[2].evaluated[0].evaluation.summary["recordings"] = {
+    results[2].first.summary["recordings"] = {
         "best": {"seed": 1, "return": 2.0, "file": "best_seed1.mcap"}
     }
     text = page([settings_table(TABLE, results).shown], [], results, Media(tmp_path, is_copied=False))
