@@ -122,9 +122,7 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
 def test_cells_lead_to_their_rows_and_rows_show_their_videos(results, tmp_path):
     folder = results[2].first.folder
     (folder / "best_seed1.mp4").write_bytes(b"")
-    results[2].first.summary["recordings"] = {
-        "best": {"seed": 1, "return": 2.0, "file": "best_seed1.mcap"}
-    }
+    results[2].first.summary["recordings"] = {"best": {"seed": 1, "return": 2.0, "file": "best_seed1.mcap"}}
     text = page([settings_table(TABLE, results).shown], [], results, Media(tmp_path, is_copied=False))
     anchor = "row-table4--transfer_imf_infer1--delay-120-ms--continue"
     assert text.count(f'<a href="#{anchor}">') == 1
