@@ -34,7 +34,7 @@ class ActionChunking:
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,)."""
-        mean, log_variance = core.style(context, actions, valid)
+        mean, log_variance = (part.to(actions) for part in core.style(context, actions, valid))
         noise = torch.randn(mean.shape, generator=rng).to(mean)
         chunk = core(context, mean + (0.5 * log_variance).exp() * noise)
         error = masked_mean((chunk - actions).abs(), valid)
@@ -55,5 +55,8 @@ class ActionChunking:
 
 
 def divergence_from_standard_normal(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """KL(N(mean, exp(log_variance)) || N(0, 1)), summed over the dimensions: (B, Z) -> (B,)."""
-    return 0.5 * (mean.square() + log_variance.exp() - log_variance - 1).sum(-1)
+    """KL(N(mean, exp(log_variance)) || N(0, 1)), summed over the dimensions: (B, Z) -> (B,).
+
+    It is a small difference of large numbers: in bf16 it comes out negative, so that callers convert before.
+    """
+    return 0.5 * (mean.square() + log_variance.expm1() - log_variance).sum(-1)

@@ -37,6 +37,19 @@ def test_the_divergence_enters_with_its_weight():
     torch.testing.assert_close(loss(7.0) - loss(0.0), 7.0 * divergence)
 
 
+def test_the_divergence_is_not_computed_in_bf16():
+    core, context, actions = make_core(), torch.zeros(3, 2, 16), torch.randn(3, 4, 2)
+    with torch.no_grad():  # variances near one, where bf16 has too few digits for the difference
+        core.style_output.weight.zero_()
+        core.style_output.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.03, -0.05, 0.07]))
+    valid = torch.ones(3, 4, dtype=torch.bool)
+    with torch.autocast("cpu", torch.bfloat16):
+        _, logs = ActionChunking(kl_weight=10.0, clip=10.0).loss(core, context, actions, valid, torch.Generator())
+    bias = core.style_output.bias.to(torch.bfloat16).float()
+    torch.testing.assert_close(logs["divergence"], divergence_from_standard_normal(bias[:3], bias[3:]))
+    assert logs["divergence"] > 0
+
+
 def test_a_rollout_takes_style_zero():
     core, generator, context = make_core(), ActionChunking(kl_weight=10.0, clip=10.0), torch.randn(3, 2, 16)
     chunks = [generator.sample(core, context, torch.randn(3, 4, 2), nfe=1) for _ in range(2)]
