@@ -16,7 +16,7 @@ from imfvla.config.protocol import EvaluationOptions
 from imfvla.environments.rollout import SIMULATION_ENDED, run_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
-from imfvla.figures.panels import stages_of, tasks_of
+from imfvla.figures.panels import panels_of, stages_of
 from imfvla.recording import McapSink, VideoSink, read_episode, read_index
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.mapping import PATH, read_mapping
@@ -187,8 +187,8 @@ def test_a_new_task_has_its_table_and_panels_from_the_mapping_alone(world, tmp_p
     assert shown.title == "Known policies"
     assert shown.rows[0][:3] == ("Known (infer1)", "1", "ours")
     assert shown.rows[0][7].startswith("1/4" if world.stages else "2/4")
-    assert list(tasks_of([result])) == ["socket", "transfer", world.name]
-    assert stages_of(world.name, [result]) == world.stages
+    assert list(panels_of([result])) == ["socket peg insertion", "object transfer", world.name]
+    assert stages_of([result]) == world.stages
     with pytest.raises(UserError, match=f"of_known is of the task socket, but .* played {world.name}"):
         check_equal_protocols([answer], "socket")
 

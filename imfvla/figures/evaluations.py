@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imfvla.figures.names import policy_of
-from imfvla.figures.panels import look, nfe_ticks, say_nothing_yet, tasks_of
+from imfvla.figures.panels import look, nfe_ticks, own_tables, panels_of, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.mapping import read_mapping
@@ -20,30 +20,26 @@ Line = list[Result]
 def success_by_evaluations(results: Sequence[Result]) -> Figure:
     """Policies evaluated at several NFE, with the weights at the end of training and Wilson intervals.
 
-    Tables that are not the paper's and have a figure of their own are left out.
+    Tables that are not the paper's are left out.
     """
-    mapping = read_mapping()
-    elsewhere = {
-        row.experiment
-        for table in mapping.of_rows
-        if table.printed is None and table.figure is not None
-        for row in mapping.of_table(table.name)
-    }
-    shown = [result for result in results if result.is_last and _experiment(result) not in elsewhere]
+    elsewhere = own_tables(read_mapping())
+    shown = [result for result in results if result.is_last and result.first.experiment not in elsewhere]
     last = sorted(shown, key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]
-    titles = tasks_of([line[0] for line in lines])
-    panels = {task: _by_method([line for line in lines if line[0].task == task]) for task in titles}
+    panels = {
+        title: _by_method([line for line in lines if line[0] in found])
+        for title, found in panels_of([line[0] for line in lines]).items()
+    }
     changes = list(dict.fromkeys(_policy(line)[1] for line in lines))
-    rows = {task: -(-max(len(of_task), 1) // COLUMNS) for task, of_task in panels.items()}
+    rows = {title: -(-max(len(methods), 1) // COLUMNS) for title, methods in panels.items()}
     with style():
         figure = new_figure(WIDTH, 0.7 + 2.7 * sum(rows.values()))
-        parts = figure.subfigures(len(titles), 1, height_ratios=list(rows.values()), squeeze=False)[:, 0]
-        for part, task in zip(parts, titles, strict=True):
-            part.suptitle(titles[task], x=0.01, ha="left", fontsize=11, weight="bold")
-            axes = part.subplots(rows[task], COLUMNS, sharey=True, squeeze=False)
-            _task(axes.ravel().tolist(), panels[task], changes)
+        parts = figure.subfigures(len(rows), 1, height_ratios=list(rows.values()), squeeze=False)[:, 0]
+        for part, title in zip(parts, panels, strict=True):
+            part.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+            axes = part.subplots(rows[title], COLUMNS, sharey=True, squeeze=False)
+            _methods(axes.ravel().tolist(), panels[title], changes)
             for side in axes[:, 0]:
                 side.set_ylabel("success-like [%]")
         handles = {
@@ -63,7 +59,7 @@ def _by_method(lines: Sequence[Line]) -> dict[str, list[Line]]:
     return found
 
 
-def _task(axes: Sequence[Axes], methods: dict[str, list[Line]], changes: Sequence[str]) -> None:
+def _methods(axes: Sequence[Axes], methods: dict[str, list[Line]], changes: Sequence[str]) -> None:
     for axis in axes[max(len(methods), 1) :]:
         axis.set_axis_off()
     if not methods:
@@ -86,10 +82,6 @@ def _panel(axes: Axes, lines: Sequence[Line], changes: Sequence[str]) -> None:
                       **look(changes.index(change)))  # fmt: skip
     ticks = nfe_ticks(axes, (result.nfe for line in lines for result in line))
     axes.set_xlim(0.75 * ticks[0], 1.35 * ticks[-1])
-
-
-def _experiment(result: Result) -> str:
-    return result.first.experiment
 
 
 def _policy(line: Line) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from imfvla.figures.names import result_name
-from imfvla.figures.panels import say_nothing_yet, stages_of, tasks_of
+from imfvla.figures.panels import panels_of, say_nothing_yet, stages_of
 from imfvla.figures.style import INK, VERMILION, WIDTH, new_figure, style
 from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
@@ -27,23 +27,21 @@ def first_failed_stage(row: Row) -> int | None:
 def failed_stages(results: Sequence[Result]) -> Figure:
     """A bar for each result: the share of episodes whose first failed stage is each of the stages.
 
-    A panel for each task; tasks without stages have none.
+    A panel for each task and each table that is not the paper's; tasks without stages have none.
     """
-    measured = [result for result in results if not result.is_missing]
-    titles = tasks_of(measured)
-    rows = {task: _sorted([result for result in measured if result.task == task]) for task in titles}
-    stages = {task: names for task in titles if (names := stages_of(task, rows[task]))}
-    heights = [FRAME + BAR * max(len(rows[task]), 2) for task in stages]
+    rows = {title: _sorted(found) for title, found in panels_of(results).items()}
+    stages = {title: names for title, found in rows.items() if (names := stages_of(found))}
+    heights = [FRAME + BAR * max(len(rows[title]), 2) for title in stages]
     with style():
         figure = new_figure(WIDTH, sum(heights, start=0.0) or FRAME)
         if not stages:
             say_nothing_yet(figure.subplots(), "no task with stages")
             return figure
         parts = figure.subfigures(len(stages), 1, height_ratios=heights, squeeze=False)[:, 0]
-        for part, task in zip(parts, stages, strict=True):
+        for part, title in zip(parts, stages, strict=True):
             axes = part.subplots()
-            axes.set_title(titles[task], weight="bold")
-            _bars(axes, stages[task], rows[task])
+            axes.set_title(title, weight="bold")
+            _bars(axes, stages[title], rows[title])
     return figure
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from imfvla.figures.description import generator_name
 from imfvla.figures.names import training_of
-from imfvla.figures.panels import look, plain_log_ticks, say_nothing_yet, tasks_of
+from imfvla.figures.panels import look, panels_of, plain_log_ticks, say_nothing_yet
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.results import Result
@@ -31,24 +31,22 @@ Curves = dict[str, tuple[np.ndarray, np.ndarray]]  # steps and losses by name
 
 
 def learning_curves(results: Sequence[Result]) -> Figure:
-    """Of all runs with an evaluation: a panel for each task and kind of loss, most curves first."""
-    titles = tasks_of(results)
-    panels = {task: _curves([result for result in results if result.task == task]) for task in titles}
-    rows = {task: _rows(of_task) for task, of_task in panels.items()}
+    """Of all runs with an evaluation: a panel for each kind of loss, by task or table, most curves first."""
+    rows = {title: _rows(_curves(found)) for title, found in panels_of(results).items()}
     heights = {
-        task: [PANEL + LEGEND_LINE * max(_lines(curves) for _, curves in row) for row in found]
-        for task, found in rows.items()
+        title: [PANEL + LEGEND_LINE * max(_lines(curves) for _, curves in row) for row in found]
+        for title, found in rows.items()
     }
     with style():
-        totals = [0.3 + sum(of_task) for of_task in heights.values()]
+        totals = [0.3 + sum(of_title) for of_title in heights.values()]
         figure = new_figure(WIDTH, sum(totals))
-        parts = figure.subfigures(len(titles), 1, height_ratios=totals, squeeze=False)[:, 0]
-        for part, task in zip(parts, titles, strict=True):
-            part.suptitle(titles[task], x=0.01, ha="left", fontsize=11, weight="bold")
-            cells = part.subfigures(len(rows[task]), COLUMNS, height_ratios=heights[task], squeeze=False)
-            for of_row, row in zip(cells, rows[task], strict=True):
-                for cell, (title, curves) in zip(of_row, row, strict=False):
-                    _panel(cell.subplots(), title, curves)
+        parts = figure.subfigures(len(rows), 1, height_ratios=totals, squeeze=False)[:, 0]
+        for part, title in zip(parts, rows, strict=True):
+            part.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+            cells = part.subfigures(len(rows[title]), COLUMNS, height_ratios=heights[title], squeeze=False)
+            for of_row, row in zip(cells, rows[title], strict=True):
+                for cell, (kind, curves) in zip(of_row, row, strict=False):
+                    _panel(cell.subplots(), kind, curves)
     return figure
 
 

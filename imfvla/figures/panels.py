@@ -7,23 +7,43 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from imfvla.figures.style import CYCLE, GREY, MARKERS
-from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.mapping import Mapping, read_mapping
 from imfvla.reporting.results import Result
 
 LINES = ("-", "--", ":", "-.")
 
 
-def tasks_of(results: Sequence[Result]) -> dict[str, str]:
-    """Title by task, a panel for each: the tasks of printed tables, then the others of the results."""
+def panels_of(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Results by the title of their panel: the printed tables' tasks first, then the others, by title.
+
+    The experiments of a table that is not the paper's have a panel of their own, with its title: they may play a task
+    of the paper with other demonstrations.
+    """
     mapping = read_mapping()
+    own = own_tables(mapping)
     drawn = {table.task for table in mapping.of_rows if table.printed is not None}
-    names = [task.name for task in mapping.tasks if task.name in drawn]
-    others = sorted({result.task for result in results if result.task is not None} - set(names))
-    return {name: mapping.task(name).title for name in (*names, *others)}
+    found: dict[str, list[Result]] = {task.title: [] for task in mapping.tasks if task.name in drawn}
+    first = list(found)
+    for result in results:
+        if result.is_missing:
+            continue
+        title = own.get(result.first.experiment) or mapping.task(result.task or "").title
+        found.setdefault(title, []).append(result)
+    return {title: found[title] for title in (*first, *sorted(set(found) - set(first)))}
 
 
-def stages_of(task: str, results: Sequence[Result]) -> tuple[str, ...]:
-    """Names of a task's stages, as its evaluations or else tables.yaml have them; none where it has no stages.
+def own_tables(mapping: Mapping) -> dict[str, str]:
+    """The title of its table by the name of each experiment whose table is not the paper's."""
+    return {
+        row.experiment: table.title
+        for table in mapping.of_rows
+        if table.printed is None
+        for row in mapping.of_table(table.name)
+    }
+
+
+def stages_of(results: Sequence[Result]) -> tuple[str, ...]:
+    """Names of the stages of one task, as its evaluations or else tables.yaml have them; none where it has no stages.
 
     None too where the episodes have stages of several tasks, as in a scene that serves more than one.
     """
@@ -33,7 +53,9 @@ def stages_of(task: str, results: Sequence[Result]) -> tuple[str, ...]:
         for found in result.evaluated
         if "stages" in found.evaluation.summary
     ]
-    names = tuple(recorded[0]) if recorded else read_mapping().task(task).stages or ()
+    tasks = [result.task for result in results if result.task is not None]
+    named = read_mapping().task(tasks[0]).stages if tasks else None
+    names = tuple(recorded[0]) if recorded else named or ()
     counts = {len(row["first_step_of_stage"]) for result in results for row in result.episodes}
     return names if counts <= {len(names)} else ()
 

@@ -44,7 +44,9 @@ def test_the_divergence_is_not_computed_in_bf16():
         core.style_output.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.03, -0.05, 0.07]))
     valid = torch.ones(3, 4, dtype=torch.bool)
     with torch.autocast("cpu", torch.bfloat16):
-        _, logs = ActionChunking(kl_weight=10.0, clip=10.0).loss(core, context, actions, valid, torch.Generator())
+        _, logs = ActionChunking(kl_weight=10.0, clip=10.0).loss(
+            core, context, actions, valid, torch.Generator()
+        )
     bias = core.style_output.bias.to(torch.bfloat16).float()
     torch.testing.assert_close(logs["divergence"], divergence_from_standard_normal(bias[:3], bias[3:]))
     assert logs["divergence"] > 0
