@@ -1,4 +1,4 @@
-"""Success against delay, and against the severity of each condition."""
+"""Success and returns against delay, and success against the severity of each condition."""
 
 from collections.abc import Sequence
 
@@ -14,21 +14,28 @@ from imfvla.reporting.results import Result
 
 Point = tuple[float, Result]
 COLUMNS = 4
+SUCCESS, RETURN = "success_share", "avg_return"
+SCALES = {SUCCESS: 100, RETURN: 1}
 
 
 def success_by_delay(results: Sequence[Result]) -> Figure:
-    """A panel for each condition and for what the robot does meanwhile; the paused clock is at 0."""
+    """Successes and returns for each condition and for what the robot does meanwhile; the paused clock is at 0."""
     found = [result for result in results if not result.is_missing]
     conditions = list(dict.fromkeys(_change(result, "condition", NONE) for result in found)) or [NONE]
-    panels = [(condition, meanwhile) for condition in conditions for meanwhile in (HOLD, CONTINUE)]
+    panels = [
+        (condition, metric, meanwhile)
+        for condition in conditions
+        for metric in (SUCCESS, RETURN)
+        for meanwhile in (HOLD, CONTINUE)
+    ]
     methods = _methods(found)
     with style():
-        figure = new_figure(WIDTH, 0.9 + 2.7 * len(conditions))
-        axes = figure.subplots(len(conditions), 2, sharex=True, sharey=True, squeeze=False).ravel()
-        for axis, (condition, meanwhile) in zip(axes, panels, strict=True):
+        figure = new_figure(WIDTH, 0.9 + 4.4 * len(conditions))
+        axes = figure.subplots(2 * len(conditions), 2, sharex=True, sharey="row", squeeze=False).ravel()
+        for axis, (condition, metric, meanwhile) in zip(axes, panels, strict=True):
             world = "" if condition == NONE else f", {condition}"
-            axis.set_title(f"the robot {'holds' if meanwhile == HOLD else 'continues'} meanwhile{world}")
-            axis.set_xlabel("delay of a chunk [ms]")
+            if metric == SUCCESS:
+                axis.set_title(f"the robot {'holds' if meanwhile == HOLD else 'continues'} meanwhile{world}")
             lines = {
                 method: [
                     (_delay(result), result)
@@ -39,8 +46,11 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
                 ]
                 for method in methods
             }
-            _draw(axis, lines, methods)
-        _finish(figure, axes[::2])
+            _draw(axis, lines, methods, metric, apart=3)
+            _say_unit(axis, metric, is_left=meanwhile == HOLD)
+        for axis in axes[-2:]:
+            axis.set_xlabel("delay of a chunk [ms]")
+        _legend(figure)
     return figure
 
 
@@ -71,22 +81,26 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
                 ]
                 for method in methods
             }
-            _draw(axis, lines, methods)
-        _finish(figure, axes[:count:columns])
+            _draw(axis, lines, methods, SUCCESS, apart=0.05)
+            _say_unit(axis, SUCCESS, is_left=axis in axes[:count:columns])
+        _legend(figure)
     return figure
 
 
-def _draw(axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str]) -> None:
+def _draw(
+    axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str], metric: str, apart: float
+) -> None:
+    """A line for each method, `apart` from the next one along x, so that intervals do not hide each other."""
     if not any(lines.values()):
         say_nothing_yet(axes, "nothing measured yet")
     for method, points in lines.items():
         if points:
             points = sorted(points, key=lambda point: point[0])
-            shares = [result.metric("success_share").scaled(100) for _, result in points]
+            measured = [result.metric(metric).scaled(SCALES[metric]) for _, result in points]
             axes.errorbar(
-                [x for x, _ in points],
-                [share.value for share in shares],
-                yerr=errors(shares),
+                [x + apart * (methods.index(method) - (len(methods) - 1) / 2) for x, _ in points],
+                [one.value for one in measured],
+                yerr=errors(measured),
                 label=method,
                 **look(methods.index(method)),
                 markersize=4.5,
@@ -95,10 +109,16 @@ def _draw(axes: Axes, lines: dict[str, list[Point]], methods: Sequence[str]) -> 
             )
 
 
-def _finish(figure: Figure, left: Sequence[Axes]) -> None:
-    for axes in left:
-        axes.set_ylabel("success-like [%]")
+def _say_unit(axes: Axes, metric: str, *, is_left: bool) -> None:
+    if metric == SUCCESS:
         axes.set_ylim(-3, 103)
+    else:
+        axes.set_ylim(bottom=0)
+    if is_left:
+        axes.set_ylabel("success-like [%]" if metric == SUCCESS else "average return")
+
+
+def _legend(figure: Figure) -> None:
     handles = {
         text: handle
         for axes in figure.axes

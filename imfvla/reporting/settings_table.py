@@ -64,8 +64,8 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     measured = [one for one in found if one.success]
     notes = [
         "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
-        f"from the same starts. A star: p below {ALPHA} (exact McNemar, Holm over {len(measured)} comparisons). A "
-        "dash: the setting is in no line for this row.",
+        f"from the same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
+        f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
         *(_sentence(usual[name], [one for one in measured if one.usual.name == name]) for name in usual),
         *_events([one.result for one in found]),
         *(f"{one.result.name}: refused, because {one.refused}." for one in found if one.refused),
@@ -90,7 +90,7 @@ def _compared(result: Result, usual: Result) -> Changed:
 
 
 def _usual_cell(result: Result) -> str:
-    return MISSING if result.is_missing else _count(result)
+    return MISSING if result.is_missing else f"{_count(result)}, {_returned(result)}"
 
 
 def _cell(one: Changed | None) -> str:
@@ -99,13 +99,18 @@ def _cell(one: Changed | None) -> str:
     if one.result.is_missing or one.refused:
         return REFUSED if one.refused else MISSING
     if one.success is None:
-        return _count(one.result)
+        return f"{_count(one.result)}, {_returned(one.result)}"
     star = "*" if one.p_holm is not None and one.p_holm < ALPHA else ""
-    return f"{_count(one.result)} ({100 * one.success.result.value:+.0f}{star})"
+    change = f"({100 * one.success.result.value:+.0f}{star})"
+    return f"{_count(one.result)} {change}, {_returned(one.result)}"
 
 
 def _count(result: Result) -> str:
     return f"{sum(row['success'] for row in result.episodes)}/{len(result.episodes)}"
+
+
+def _returned(result: Result) -> str:
+    return f"{result.metric('avg_return').value:.0f}"
 
 
 def _sentence(usual: Result, measured: Sequence[Changed]) -> str:

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from synthetic_runs import answer_row
@@ -103,9 +104,13 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
     document = settings_table(TABLE, results)
     unchanged, delayed, bumped = document.shown.rows
     counts = [sum(row["success"] for row in result.episodes) for result in results]
-    assert unchanged == ("unchanged", f"{counts[0]}/100", f"{counts[1]}/100")
-    assert delayed == ("delay 120 ms, continue", f"{counts[2]}/100 ({counts[2] - counts[0]:+d}*)", "missing")
-    assert bumped == ("bump 2", f"{counts[4]}/100 (+0)", "missing")
+    returns = [
+        f"{np.mean([row['total_reward'] for row in result.episodes] or [0]):.0f}" for result in results
+    ]
+    assert unchanged == ("unchanged", f"{counts[0]}/100, {returns[0]}", f"{counts[1]}/100, {returns[1]}")
+    late = f"{counts[2]}/100 ({counts[2] - counts[0]:+d}*), {returns[2]}"
+    assert delayed == ("delay 120 ms, continue", late, "missing")
+    assert bumped == ("bump 2", f"{counts[4]}/100 (+0), {returns[4]}", "missing")
     assert "fewer successes than in the unchanged world in 1 of 2 settings" in " ".join(document.shown.notes)
     assert document.shown.commands == (("table4", "python -m imfvla.train -m +sweep=clock"),)
     lines = list(csv.DictReader(io.StringIO(document.data.csv())))
@@ -182,12 +187,15 @@ def test_figures_have_a_line_for_every_method(results):
     delays = success_by_delay(results)
     titles = [axes.get_title(loc="left") for axes in delays.axes]
     assert titles == [
-        "the robot holds meanwhile", "the robot continues meanwhile", "the robot holds meanwhile, bump",
-        "the robot continues meanwhile, bump",
+        "the robot holds meanwhile", "the robot continues meanwhile", "", "",
+        "the robot holds meanwhile, bump", "the robot continues meanwhile, bump", "", "",
     ]  # fmt: skip
-    assert [len(axes.containers) for axes in delays.axes] == [2, 2, 1, 1]
-    x = [line.get_xdata().tolist() for line in delays.axes[1].lines if len(line.get_xdata()) == 2]
-    assert [0.0, 120.0] in x
+    assert [len(axes.containers) for axes in delays.axes] == [2, 2, 2, 2, 1, 1, 1, 1]
+    for axes, metric, scale in ((delays.axes[1], "success_share", 100), (delays.axes[3], "avg_return", 1)):
+        (line,) = (bars.lines[0] for bars in axes.containers if len(bars.lines[0].get_xdata()) == 2)
+        assert np.diff(line.get_xdata()) == pytest.approx(120)
+        expected = [scale * results[index].metric(metric).value for index in (0, 2)]
+        assert line.get_ydata().tolist() == pytest.approx(expected)
     row = replace(results[2].row, changes=(*results[2].row.changes, ("prefix", "guided")))
     guided = Result.of(replace(results[2].answer, row=row))
     labels = success_by_delay([*results, guided]).axes[1].get_legend_handles_labels()[1]
