@@ -63,7 +63,7 @@ def policies(tmp_path):
 def test_it_trains_every_policy_of_the_tables_once_and_the_unimodal_ones():
     found = TOOL.policies("campaign")
     names = [policy.name for policy in found]
-    assert len(set(names)) == len(names) == 36
+    assert len(set(names)) == len(names) == 37
     printed = [row for row in read_mapping().rows if row.table in ("table1", "table2")]
     assert {f"{row.experiment}/{row.run or 'default'}" for row in printed} <= {*names}
     assert sum("task.expert.modes=1" in name for name in names) == 8
