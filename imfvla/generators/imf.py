@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from imfvla.errors import UserError
 from imfvla.generators.base import masked_error
-from imfvla.generators.velocity import AverageVelocity, Pushes, interpolate
+from imfvla.generators.velocity import AverageVelocity, interpolate
 from imfvla.options import at_least
 
 
@@ -62,12 +62,12 @@ class ImprovedMeanFlow(AverageVelocity):
         z, target = interpolate(x, noise, t)
         some = self.compound_rows(batch, x.device)
 
-        v, u, push = self._velocities(core, z, r, t, context, some)
+        v, u, dudt = self.velocities(core, z, r, t, context, some)
         instant_error = t**self.time_power * masked_error(v - target, valid)
 
         r, t, valid = r[some], t[some], valid[some]
         v_fixed = v.detach()[some]
-        change = (t - r)[:, None, None] * push(v_fixed)
+        change = (t - r)[:, None, None] * dudt
         compound_target = target[some] if self.compound_target == "sample" else v_fixed
         compound_error = t**self.time_power * masked_error(u + change - compound_target, valid)
 
@@ -79,19 +79,20 @@ class ImprovedMeanFlow(AverageVelocity):
             "change_rms": change.square().mean().sqrt(),
         }
 
-    def _velocities(
+    def velocities(
         self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, some: Tensor
-    ) -> tuple[Tensor, Tensor, Pushes]:
-        """v (B * N, H, A), u of the rows `some`, and what gives its derivative, for a context of the B observations.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """v (B * N, H, A), u of the rows `some`, and du/dt along v of these, for a context of the B observations.
 
         Where v is u at r = t, one pass of the core answers both.
         """
         if self.v_from == "head":
             v = self.instant_velocity(core, z, t, context.repeat(self.draws))
             own = context.repeat(self.compound_draws)
-            return v, *self.linearise(core, z[some], r[some], t[some], own, slice(None))
+            u, push = self.linearise(core, z[some], r[some], t[some], own, slice(None))
+            return v, u, push(v.detach()[some])
         observations = torch.arange(len(z), device=z.device) // self.draws
-        both = self.linearise(
+        both, push = self.linearise(
             core,
             torch.cat((z, z[some])),
             torch.cat((t, r[some])),
@@ -99,4 +100,5 @@ class ImprovedMeanFlow(AverageVelocity):
             context.rows(torch.cat((observations, observations[some]))),
             slice(len(z), None),
         )
-        return both[0][: len(z)], both[0][len(z) :], both[1]
+        v, u = both[: len(z)], both[len(z) :]
+        return v, u, push(v.detach()[some])

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
-from imfvla.nn.dual import Rows, Tape
+from imfvla.nn.dual import Rows, Tape, as_written
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
 
@@ -180,7 +180,8 @@ class AverageVelocity(LinearPath):
             return self.velocity(core, z, r, t, context), self._in_full(core, z, r, t, context, rows)
         tape = Tape(rows)
         moving, start, end = tape.input(z), tape.input(r), tape.input(t)
-        output = core(moving, end, start, context)
+        with as_written():
+            output = core(moving, end, start, context)
         u = output.value
         if self.parametrisation == "data":
             u = (z - u) / t[:, None, None]

@@ -12,6 +12,7 @@ Shapes: B batch; of the tangents the first dimension has the tape's rows alone.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -85,6 +86,11 @@ class Dual:
 
 
 Same = TypeVar("Same", Tensor, Dual)
+
+
+def as_written() -> AbstractContextManager[Any]:
+    """Inside, a compiled core runs eagerly: what was compiled takes no `Dual`s. Code that is compiled whole does."""
+    return nullcontext() if torch.compiler.is_compiling() else torch.compiler.set_stance("force_eager")
 
 
 def linear_map(function: Callable[..., Tensor], *inputs: Same) -> Same:
