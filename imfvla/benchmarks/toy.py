@@ -17,6 +17,8 @@ from torch import Tensor, nn
 
 from imfvla.command.composition import compose
 from imfvla.config.construction import construct
+from imfvla.generators.velocity import Pushes
+from imfvla.nn.dual import LayerNorm, Same, SiLU, linear_map
 from imfvla.nn.embeddings import TimeEmbedding
 from imfvla.nn.linear import Linear
 from imfvla.nn.transformer import copy_weights
@@ -79,6 +81,8 @@ class PlaneCore(nn.Module):
     With `velocity_head` average and instantaneous velocity have layers each of their own, as in `TransformerCore`.
     """
 
+    takes_duals = True
+
     def __init__(self, width: int, depth: int, *, velocity_head: bool = False) -> None:
         super().__init__()
         self.input = Linear(2, width)
@@ -86,22 +90,22 @@ class PlaneCore(nn.Module):
         self.interval = TimeEmbedding(width, MAX_RAD)
         self.blocks = nn.ModuleList(
             nn.Sequential(
-                nn.LayerNorm(width, elementwise_affine=False),
+                LayerNorm(width, elementwise_affine=False),
                 Linear(width, width),
-                nn.SiLU(),
+                SiLU(),
                 Linear(width, width),
             )
             for _ in range(depth)
         )
-        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.norm = LayerNorm(width, elementwise_affine=False)
         self.output = Linear(width, 2)
         self.average: PlaneCore | None = copy.deepcopy(self) if velocity_head else None
 
-    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Any) -> Tensor:
+    def forward(self, x: Same, t: Same, r: Same, context: Any) -> Same:
         """x (B, 1, 2), times (B,) -> (B, 1, 2)."""
         return (self.average or self).layers(x, t, r)
 
-    def instant(self, x: Tensor, t: Tensor, context: Any) -> Tensor:
+    def instant(self, x: Same, t: Same, context: Any) -> Same:
         """What the layers of the instantaneous velocity say, r = t."""
         return self.layers(x, t, t)
 
@@ -109,12 +113,12 @@ class PlaneCore(nn.Module):
         """The layers of the average velocity take the weights of those of the instantaneous one."""
         copy_weights(self, self.average)
 
-    def layers(self, x: Tensor, t: Tensor, r: Tensor) -> Tensor:
+    def layers(self, x: Same, t: Same, r: Same) -> Same:
         condition = self.time(t) + self.interval(t - r)
         hidden = self.input(x[:, 0]) + condition
         for block in self.blocks:
             hidden = hidden + block(hidden + condition)
-        return self.output(self.norm(hidden)).unsqueeze(1)
+        return linear_map(lambda x: x.unsqueeze(1), self.output(self.norm(hidden)))
 
 
 class NoContext:
@@ -133,13 +137,13 @@ def shipped(name: str) -> Any:
 
 def flipped(generator: Any) -> Any:
     """The same with the sign of its derivative flipped: a mistake that the judgement must find."""
-    derivative = generator.derivative
+    linearise = generator.linearise
 
-    def wrong(*arguments: Any) -> tuple[Tensor, Tensor]:
-        u, dudt = derivative(*arguments)
-        return u, -dudt
+    def wrong(*arguments: Any) -> tuple[Tensor, Pushes]:
+        u, push = linearise(*arguments)
+        return u, lambda v: -push(v)
 
-    generator.derivative = wrong
+    generator.linearise = wrong
     return generator
 
 

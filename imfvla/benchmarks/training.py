@@ -125,18 +125,23 @@ def _timed(spent: dict[str, float], part: str) -> Iterator[None]:
 
 @contextmanager
 def _timed_derivative(generator: Any, spent: dict[str, float]) -> Iterator[None]:
-    """Times `generator.derivative` separately, where the generator has one."""
-    original = getattr(generator, "derivative", None)
+    """Times what `generator.linearise` returns for derivatives separately, where the generator has it."""
+    original = getattr(generator, "linearise", None)
     if original is None:
         yield
         return
 
-    def derivative(*args: Any) -> Any:
-        with _timed(spent, "jvp"), _timed(spent, "derivative"):
-            return original(*args)
+    def linearise(*args: Any) -> Any:
+        u, push = original(*args)
 
-    generator.derivative = derivative
+        def timed(v: Any) -> Any:
+            with _timed(spent, "jvp"), _timed(spent, "derivative"):
+                return push(v)
+
+        return u, timed
+
+    generator.linearise = linearise
     try:
         yield
     finally:
-        del generator.derivative
+        del generator.linearise

@@ -28,7 +28,8 @@ class FlowMatching(LinearPath):
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
-        context, x, noise, valid = self.repeat(context, actions, valid, rng)
+        x, noise, valid = self.repeat(actions, valid, rng)
+        context = context.repeat(self.draws)
         t = self.draw_times(len(x), rng).to(x)
         z, target = interpolate(x, noise, t)
         error = t**self.time_power * masked_error(self.velocity(core, z, t, t, context) - target, valid)

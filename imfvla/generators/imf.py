@@ -47,6 +47,7 @@ class ImprovedMeanFlow(AverageVelocity):
             raise UserError(
                 f"generator.compound_target must be sample or network, found {compound_target!r}."
             )
+        self.v_from = v_from
         self.core_interface = "flow and v-head" if v_from == "head" else "flow"
         self.instant_weight = instant_weight
         self.compound_target = compound_target
@@ -56,18 +57,16 @@ class ImprovedMeanFlow(AverageVelocity):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         batch = len(actions)
-        context, x, noise, valid = self.repeat(context, actions, valid, rng)
+        x, noise, valid = self.repeat(actions, valid, rng)
         r, t = (time.to(x) for time in self.intervals(len(x), rng))
         z, target = interpolate(x, noise, t)
         some = self.compound_rows(batch, x.device)
 
-        v = self.instant_velocity(core, z, t, context)
+        v, u, dudt = self.velocities(core, z, r, t, context, some)
         instant_error = t**self.time_power * masked_error(v - target, valid)
 
-        z, r, t, context, valid = z[some], r[some], t[some], context.rows(some), valid[some]
+        r, t, valid = r[some], t[some], valid[some]
         v_fixed = v.detach()[some]
-        u = self.velocity(core, z, r, t, context)
-        _, dudt = self.derivative(core, z, r, t, v_fixed, context.detach(z.dtype))
         change = (t - r)[:, None, None] * dudt
         compound_target = target[some] if self.compound_target == "sample" else v_fixed
         compound_error = t**self.time_power * masked_error(u + change - compound_target, valid)
@@ -79,3 +78,27 @@ class ImprovedMeanFlow(AverageVelocity):
             "compound_error": compound_error.detach().mean(),
             "change_rms": change.square().mean().sqrt(),
         }
+
+    def velocities(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, some: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """v (B * N, H, A), u of the rows `some`, and du/dt along v of these, for a context of the B observations.
+
+        Where v is u at r = t, one pass of the core answers both.
+        """
+        if self.v_from == "head":
+            v = self.instant_velocity(core, z, t, context.repeat(self.draws))
+            own = context.repeat(self.compound_draws)
+            u, push = self.linearise(core, z[some], r[some], t[some], own, slice(None))
+            return v, u, push(v.detach()[some])
+        observations = torch.arange(len(z), device=z.device) // self.draws
+        both, push = self.linearise(
+            core,
+            torch.cat((z, z[some])),
+            torch.cat((t, r[some])),
+            torch.cat((t, t[some])),
+            context.rows(torch.cat((observations, observations[some]))),
+            slice(len(z), None),
+        )
+        v, u = both[: len(z)], both[len(z) :]
+        return v, u, push(v.detach()[some])

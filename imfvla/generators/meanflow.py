@@ -13,18 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.generators.base import masked_error
-from imfvla.generators.velocity import AverageVelocity, interpolate
+from imfvla.generators.velocity import AverageVelocity, Pushes, interpolate
 
 
 class MeanFlow(AverageVelocity):
     """Learns and samples an average velocity; `compound_draws` of `draws` have r < t, the others r = t."""
 
-    def target(
-        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
-    ) -> tuple[Tensor, Tensor]:
-        """v - (t - r) du/dt along (v, 0, 1), which u(z, r, t) is regressed on, and (t - r) du/dt; no gradient."""
-        _, dudt = self.derivative(core, z, r, t, v, context)
-        change = (t - r)[:, None, None] * dudt
+    def target(self, push: Pushes, r: Tensor, t: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """v - (t - r) du/dt, which u(z, r, t) is regressed on, and (t - r) du/dt; `push` gives du/dt along v."""
+        change = (t - r)[:, None, None] * push(v)
         return v - change, change
 
     def loss(
@@ -32,15 +29,14 @@ class MeanFlow(AverageVelocity):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         batch = len(actions)
-        context, x, noise, valid = self.repeat(context, actions, valid, rng)
+        x, noise, valid = self.repeat(actions, valid, rng)
+        context = context.repeat(self.draws)
         r, t = (time.to(x) for time in self.intervals(len(x), rng))
         z, v = interpolate(x, noise, t)
         some = self.compound_rows(batch, x.device)
         r = t.index_copy(0, some, r[some])
-        target, change = self.target(
-            core, z[some], r[some], t[some], v[some], context.rows(some).detach(z.dtype)
-        )
-        u = self.velocity(core, z, r, t, context)
+        u, push = self.linearise(core, z, r, t, context, some)
+        target, change = self.target(push, r[some], t[some], v[some])
         error = t**self.time_power * masked_error(u - v.index_copy(0, some, target), valid)
         loss = self.per_chunk(error, batch)
         return loss, {

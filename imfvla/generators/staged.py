@@ -93,7 +93,8 @@ class StagedMeanFlow(AverageVelocity):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws: of v in the first stage, of u in the second."""
         batch = len(actions)
-        context, x, noise, valid = self.repeat(context, actions, valid, rng)
+        x, noise, valid = self.repeat(actions, valid, rng)
+        context = context.repeat(self.draws)
         if self.learns_average:
             r, t = (time.to(x) for time in self.intervals(len(x), rng))
             z, _ = interpolate(x, noise, t)

@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
+from imfvla.nn.dual import Rows, Tape, as_written
 from imfvla.nn.forward_mode import jvp
 from imfvla.options import above, at_least, within
 
+Pushes = Callable[[Tensor], Tensor]  # velocities (B, H, A) -> derivatives along them (B, H, A)
 MIN_TIME = 0.02  # of training in the data form u = (z - D) / t, whose error grows without bound towards t = 0
 
 
@@ -82,13 +84,11 @@ class LinearPath:
         t = self.times(count, rng)
         return t.clamp(min=MIN_TIME) if self.parametrisation == "data" else t
 
-    def repeat(
-        self, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
-    ) -> tuple[Any, Tensor, Tensor, Tensor]:
-        """Context, actions, their noise and validity for all draws, those of an observation together: (B * N, ...)."""
+    def repeat(self, actions: Tensor, valid: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Actions, their noise and validity for all draws, those of an observation together: (B * N, ...)."""
         x = actions.repeat_interleave(self.draws, dim=0)
         noise = torch.randn(x.shape, generator=rng).to(x)
-        return context.repeat(self.draws), x, noise, valid.repeat_interleave(self.draws, dim=0)
+        return x, noise, valid.repeat_interleave(self.draws, dim=0)
 
     def adapt(self, error: Tensor) -> Tensor:
         """error / sg(error + offset) ** power: large errors count for less (arXiv 2505.13447)."""
@@ -165,15 +165,59 @@ class AverageVelocity(LinearPath):
             return lambda z, t, r, context: core(z, t, t, context)
         return lambda z, t, r, context: core.instant(z, t, context)
 
-    def derivative(
-        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, v: Tensor, context: Any
-    ) -> tuple[Tensor, Tensor]:
-        """u and du/dt along (v, 0, 1) in (z, r, t) (paper eq. 6), without gradient."""
-        return jvp(
-            lambda z, r, t: self.velocity(core, z, r, t, context),
-            (z, r, t),
-            (v, torch.zeros_like(r), torch.ones_like(t)),
-        )
+    def linearise(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, rows: Rows
+    ) -> tuple[Tensor, Pushes]:
+        """u(z, r, t), and what gives du/dt of its `rows` along (v, 0, 1) in (z, r, t) for v of these (paper eq. 6).
+
+        u is under autograd as in `velocity`, du/dt without gradient and in full precision. It works once. A core that
+        `takes_duals` is called once. Another one is called again, in forward mode; and so is any under autocast, since
+        in bfloat16 the derivative would be off by more than half a percent.
+        """
+        if not getattr(core, "takes_duals", False):
+            return self.velocity(core, z, r, t, context), self._forward_mode(core, z, r, t, context, rows)
+        if torch.is_autocast_enabled(z.device.type):
+            return self.velocity(core, z, r, t, context), self._in_full(core, z, r, t, context, rows)
+        tape = Tape(rows)
+        moving, start, end = tape.input(z), tape.input(r), tape.input(t)
+        with as_written():
+            output = core(moving, end, start, context)
+        u = output.value
+        if self.parametrisation == "data":
+            u = (z - u) / t[:, None, None]
+        u_fixed, t_fixed = u.detach()[rows], t[rows]
+
+        def push(v: Tensor) -> Tensor:
+            change = tape.push(
+                output, (moving, v), (start, torch.zeros_like(t_fixed)), (end, torch.ones_like(t_fixed))
+            )
+            return (
+                change
+                if self.parametrisation == "velocity"
+                else (v - change - u_fixed) / t_fixed[:, None, None]
+            )
+
+        return u, push
+
+    def _in_full(self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, rows: Rows) -> Pushes:
+        def push(v: Tensor) -> Tensor:
+            with torch.no_grad(), torch.autocast(z.device.type, enabled=False):
+                inputs = z[rows], r[rows], t[rows], context.rows(rows).detach(z.dtype)
+                return self.linearise(core, *inputs, slice(None))[1](v)
+
+        return push
+
+    def _forward_mode(
+        self, core: nn.Module, z: Tensor, r: Tensor, t: Tensor, context: Any, rows: Rows
+    ) -> Pushes:
+        fixed = context.rows(rows).detach(z.dtype)
+
+        def push(v: Tensor) -> Tensor:
+            inputs = z[rows], r[rows], t[rows]
+            tangents = v, torch.zeros_like(inputs[1]), torch.ones_like(inputs[2])
+            return jvp(lambda z, r, t: self.velocity(core, z, r, t, fixed), inputs, tangents)[1]
+
+        return push
 
     def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """Times r <= t (count,) of the compound loss."""

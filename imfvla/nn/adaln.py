@@ -9,10 +9,9 @@ Shapes: B batch, H steps, A channels, K action tokens, L context tokens, D width
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from imfvla.nn.attention import Attention
-from imfvla.nn.forward_mode import affine
+from imfvla.nn.dual import Dual, LayerNorm, Same, linear_map, shifted, silu
 from imfvla.nn.linear import Linear
 from imfvla.nn.residual import History
 from imfvla.nn.transformer import Conditioning, SwiGLU, TransformerCore
@@ -28,8 +27,16 @@ class Modulation(nn.Module):
         with torch.no_grad():
             self.linear.bias.copy_(torch.tensor(starts).repeat_interleave(width))
 
-    def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
-        return self.linear(condition).unsqueeze(1).chunk(self.num_vectors, dim=-1)
+    def forward(self, condition: Same) -> tuple[Same, ...]:
+        vectors = self.linear(condition)
+        if isinstance(vectors, Dual):
+            return tuple(
+                linear_map(lambda x, of=of: self._split(x)[of], vectors) for of in range(self.num_vectors)
+            )
+        return self._split(vectors)
+
+    def _split(self, vectors: Tensor) -> tuple[Tensor, ...]:
+        return vectors.unsqueeze(1).chunk(self.num_vectors, dim=-1)
 
 
 class AdaptiveBlock(nn.Module):
@@ -39,12 +46,12 @@ class AdaptiveBlock(nn.Module):
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.norm = LayerNorm(width, elementwise_affine=False)
         self.modulation = Modulation(width, 2 * (0.0, 1.0, 1.0))
         self.attention = Attention(width, heads)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
-    def forward(self, history: History, condition: Tensor) -> None:
+    def forward(self, history: History[Same], condition: Same) -> None:
         """Adds the increments of both sublayers under the condition (B, D)."""
         vectors = self.modulation(condition)
         for sublayer, (shift, scale, gate) in ((self.attention, vectors[:3]), (self.mlp, vectors[3:])):
@@ -66,10 +73,10 @@ class AdaptiveNormCore(TransformerCore):
         """Takes the summary, the last of the context tokens (B, L, D)."""
         return Conditioning((), self.summary(context[:, -1]))
 
-    def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+    def features(self, x: Same, t: Same, r: Same, context: Conditioning) -> Same:
         """What the output layers read of each action token: (B, K, D)."""
-        condition = F.silu(affine(self.time(t) + self.interval(t - r), None, context.summary))
-        history = self.residual.begin(affine(self.patches(x), None, self.position))
+        condition = silu(shifted(self.time(t) + self.interval(t - r), context.summary))
+        history = self.residual.begin(shifted(self.patches(x), self.position))
         for block in self.blocks:
             block(history, condition)
         shift, scale = self.modulation(condition)

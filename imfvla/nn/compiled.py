@@ -1,18 +1,20 @@
 """`torch.compile` of the parts of a policy in which training steps and predictions spend their time.
 
 Encoder, context and core are compiled apart, so that the same code serves every generator and any number of
-evaluations. Forward-mode differentiation goes through the core as it is written (`forward_mode.jvp`): compiled code
-would drop the tangents.
+evaluations. A generator whose loss has a derivative has it in `velocities`, which is compiled with the core in it.
 """
 
+import logging
 import os
 import shutil
 import warnings
+from pathlib import Path
 
 import torch
 from torch import nn
 
-from imfvla.errors import UserError
+CACHE = "TORCHINDUCTOR_CACHE_DIR"  # of inductor: what it has compiled, which later processes take from there
+log = logging.getLogger(__name__)
 
 
 def has_compiler() -> bool:
@@ -23,15 +25,31 @@ def has_compiler() -> bool:
 def compile_parts(policy: nn.Module, backend: str = "inductor") -> None:
     """Compiles encoder and core of `policy` in place, at the first call for each shape; weights keep their names.
 
-    A compiled policy computes what it computed before but for rounding (1e-4 of an action's deviation).
-
-    Raises UserError where the C++ compiler that inductor needs is missing.
+    A compiled policy computes what it computed before but for rounding (1e-4 of an action's deviation). Without the
+    C++ compiler that inductor needs it stays as it is, which a line of the log says.
     """
-    if backend == "inductor" and not has_compiler():
-        raise UserError(
-            "compile=true needs a C++ compiler, none found: install g++ or leave policies uncompiled."
+    if backend == "inductor":
+        if not has_compiler():
+            log.warning(
+                "no C++ compiler was found, so nothing is compiled: install g++ for training.compile=true"
+            )
+            return
+        os.environ.setdefault(CACHE, str(cache_directory()))
+        log.info(
+            f"compiling: the first steps take minutes, or seconds where {os.environ[CACHE]} has their code"
         )
     warnings.filterwarnings("ignore", "`torch.jit.script_method` is deprecated")  # PyTorch's own use of it
     policy.encoder.compile(backend=backend, dynamic=False)
     policy.core.compile(backend=backend, dynamic=False)
-    policy.core.condition = torch.compile(policy.core.condition, backend=backend, dynamic=False)
+    for part, name in (
+        (policy.core, "condition"),
+        (policy.core, "instant"),
+        (policy.generator, "velocities"),
+    ):
+        if hasattr(part, name):
+            setattr(part, name, torch.compile(getattr(part, name), backend=backend, dynamic=False))
+
+
+def cache_directory() -> Path:
+    """Of compiled code, in the user's cache directory."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "imfvla" / "inductor"

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from imfvla.nn.attention import Attention, CrossAttention, KeyValue
+from imfvla.nn.dual import LayerNorm
 from imfvla.nn.residual import History
 from imfvla.nn.transformer import Conditioning, SwiGLU, TransformerCore
 
@@ -21,7 +22,7 @@ class CrossBlock(nn.Module):
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.norm = LayerNorm(width, elementwise_affine=False)
         self.attention = Attention(width, heads)
         self.cross_attention = CrossAttention(width, heads)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))

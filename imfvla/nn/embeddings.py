@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from imfvla.nn.forward_mode import affine
+from imfvla.nn.dual import Same, SiLU, elementwise, linear_map
 from imfvla.nn.linear import Linear
 
 
@@ -21,8 +21,10 @@ class TimeEmbedding(nn.Module):
         self.frequencies: Tensor
         frequencies = torch.exp(torch.linspace(math.log(0.1), math.log(max_rad), num_frequencies))
         self.register_buffer("frequencies", frequencies, persistent=False)
-        self.mlp = nn.Sequential(Linear(2 * num_frequencies, width), nn.SiLU(), Linear(width, width))
+        self.mlp = nn.Sequential(Linear(2 * num_frequencies, width), SiLU(), Linear(width, width))
 
-    def forward(self, time: Tensor) -> Tensor:
-        angles = affine(time.unsqueeze(-1), self.frequencies.unsqueeze(0))
-        return self.mlp(torch.cat((angles.sin(), angles.cos()), dim=-1))
+    def forward(self, time: Same) -> Same:
+        angles = linear_map(lambda time: time.unsqueeze(-1) * self.frequencies, time)
+        sin = elementwise(torch.sin, torch.cos, angles)
+        cos = elementwise(torch.cos, lambda angles: -angles.sin(), angles)
+        return self.mlp(linear_map(lambda *parts: torch.cat(parts, dim=-1), sin, cos))

@@ -1,12 +1,14 @@
 """The linear layer of everything that is differentiated forward."""
 
-from torch import Tensor, nn
+from torch import nn
 
-from imfvla.nn.forward_mode import affine
+from imfvla.nn.dual import Dual, Same
 
 
 class Linear(nn.Linear):
-    """nn.Linear whose weights count as constants in forward mode; the same parameters, values and gradients."""
+    """nn.Linear, of `Dual`s too: the tangent costs one product with the weights."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        return affine(x, self.weight.T, self.bias)
+    def forward(self, x: Same) -> Same:
+        if not isinstance(x, Dual):
+            return super().forward(x)
+        return x.tape.add(super().forward(x.value), lambda tangent: tangent @ self.weight.detach().T, x)

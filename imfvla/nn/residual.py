@@ -6,27 +6,30 @@ A residual decides what sublayer l + 1 reads (paper eq. 10 or eq. 12) and what t
 Shapes: B batch, T tokens, D width.
 """
 
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.nn.forward_mode import affine
+from imfvla.nn.depth import attend_to_depth, depth_mean, depth_scores, depth_weights
+from imfvla.nn.dual import Dual, Same, total
+
+Kept = TypeVar("Kept", Tensor, Dual)
 
 
-class History(Protocol):
+class History(Protocol[Kept]):
     """The increments of one forward pass, as its residual keeps them."""
 
-    def read(self) -> Tensor:
+    def read(self) -> Kept:
         """Input (B, T, D) of the next sublayer."""
         ...
 
-    def add(self, increment: Tensor) -> None:
+    def add(self, increment: Kept) -> None:
         """Takes the output (B, T, D) of the sublayer that read last."""
         ...
 
-    def readout(self) -> Tensor:
+    def readout(self) -> Kept:
         """What the stack returns (B, T, D), before the final norm."""
         ...
 
@@ -37,18 +40,18 @@ class StandardResidual(nn.Module):
     def __init__(self, num_sublayers: int, width: int) -> None:
         super().__init__()
 
-    def begin(self, embedding: Tensor) -> History:
+    def begin(self, embedding: Same) -> History[Same]:
         return _Sum(embedding)
 
 
 class _Sum:
-    def __init__(self, embedding: Tensor) -> None:
+    def __init__(self, embedding: Same) -> None:
         self.total = embedding
 
-    def read(self) -> Tensor:
+    def read(self) -> Same:
         return self.total
 
-    def add(self, increment: Tensor) -> None:
+    def add(self, increment: Same) -> None:
         self.total = self.total + increment
 
     readout = read
@@ -74,13 +77,12 @@ class AttentionResidual(nn.Module):
         self.register_buffer("eps", torch.tensor(1e-6), persistent=False)
         self.query = nn.Parameter(torch.zeros(num_sublayers + (readout == "attn"), width))
 
-    def begin(self, embedding: Tensor) -> History:
+    def begin(self, embedding: Same) -> History[Same]:
         return _Increments(self, embedding)
 
-    def scores(self, source: Tensor) -> Tensor:
+    def scores(self, source: Same) -> Same:
         """w_l . RMSNorm(y) for the queries of all sublayers at once: (B, T, D) -> (B, T, number of queries)."""
-        mean_square = affine(source.square().mean(-1, keepdim=True), None, self.eps)
-        return affine(source, self.query.T) * mean_square.rsqrt()
+        return depth_scores(source, self.query, self.eps)
 
 
 class BlockAttentionResidual(AttentionResidual):
@@ -102,40 +104,48 @@ class BlockAttentionResidual(AttentionResidual):
         super().__init__(num_sublayers, width, readout)
         self.block_size = block_size
 
-    def begin(self, embedding: Tensor) -> History:
+    def begin(self, embedding: Same) -> History[Same]:
         return _BlockSums(self, embedding)
 
 
 class _Increments:
     """Every increment is a source of its own."""
 
-    def __init__(self, residual: AttentionResidual, embedding: Tensor) -> None:
+    def __init__(self, residual: AttentionResidual, embedding: Same) -> None:
         self.residual = residual
-        self.sources = [embedding]
-        self.scores = [residual.scores(embedding)]
+        self.sources: list[Same] = []
+        self.scores: list[Same] = []
+        self.columns: list[tuple[Tensor, ...]] = []  # values of the scores by query
         self.sublayer = 0  # the next one to read
+        self._append(embedding)
 
-    def add(self, increment: Tensor) -> None:
-        self.sources.append(increment)
-        self.scores.append(self.residual.scores(increment))
+    def add(self, increment: Same) -> None:
+        self._append(increment)
         self.sublayer += 1
+
+    def _append(self, source: Same) -> None:
+        self.sources.append(source)
+        self.scores.append(self.residual.scores(source))
+        self.columns.append(_value(self.scores[-1]).unbind(-1))
 
     def weights(self, query: int) -> Tensor:
         """a_{query, s} over the sources s so far, summing to 1: (B, T, s)."""
-        return torch.stack(self.scores, dim=-2)[..., query].contiguous().softmax(-1)
+        return depth_weights(self.columns, query)
 
-    def aggregate(self, query: int) -> Tensor:
+    def aggregate(self, query: int) -> Same:
         if len(self.sources) == 1:
             return self.sources[0]
-        return (self.weights(query).unsqueeze(-2) @ torch.stack(self.sources, dim=-2)).squeeze(-2)
+        if isinstance(self.sources[0], Dual):
+            return attend_to_depth(self.scores, self.sources, self.weights(query), query)
+        return depth_mean(self.weights(query), self.sources)
 
-    def read(self) -> Tensor:
+    def read(self) -> Same:
         return self.aggregate(self.sublayer)
 
-    def readout(self) -> Tensor:
+    def readout(self) -> Same:
         if self.residual.readout_kind == "attn":
             return self.aggregate(self.residual.num_sublayers)
-        return torch.stack(self.sources).sum(0)
+        return total(self.sources)
 
 
 class _BlockSums(_Increments):
@@ -143,8 +153,13 @@ class _BlockSums(_Increments):
 
     residual: BlockAttentionResidual
 
-    def add(self, increment: Tensor) -> None:
+    def add(self, increment: Same) -> None:
         if self.sublayer % self.residual.block_size:
             increment = self.sources.pop() + increment
             self.scores.pop()
+            self.columns.pop()
         super().add(increment)
+
+
+def _value(x: Same) -> Tensor:
+    return x.value if isinstance(x, Dual) else x

@@ -12,9 +12,9 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from imfvla.nn.attention import Attention, KeyValue, head_width
+from imfvla.nn.attention import Attention, KeyValue, head_width, join_heads, split_heads
+from imfvla.nn.dual import LayerNorm, Same, SiLU, linear_map, look_up, shifted
 from imfvla.nn.embeddings import TimeEmbedding
-from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.pretrained import Backbone
 from imfvla.nn.sizes import LAYERS, WIDTH
@@ -67,9 +67,8 @@ class JointAttention(Attention):
     def prepare(self, prefix: KeyValue) -> KeyValue:
         return prefix
 
-    def forward(self, x: Tensor, prefix: KeyValue) -> Tensor:
-        queries, own = self.project(x)
-        return self.attend(queries, own, prefix, self.causal)
+    def forward(self, x: Same, prefix: KeyValue) -> Same:
+        return super().forward(x, prefix, self.causal)
 
 
 class PrefixAttention(nn.Module):
@@ -90,10 +89,8 @@ class PrefixAttention(nn.Module):
         keys = self.key(keys).unflatten(-1, (self.heads, -1)).permute(0, 2, 3, 1)
         return keys, self.value(values).unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
-    def forward(self, x: Tensor, prefix: KeyValue) -> Tensor:
-        queries = self.query(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        mixed = affine(affine(queries, prefix[0]).softmax(-1), prefix[1])
-        return self.output(mixed.transpose(1, 2).flatten(2))
+    def forward(self, x: Same, prefix: KeyValue) -> Same:
+        return self.output(join_heads(look_up(split_heads(self.query(x), self.heads), *prefix)))
 
 
 class ExpertLayer(nn.Module):
@@ -101,12 +98,12 @@ class ExpertLayer(nn.Module):
 
     def __init__(self, attention: nn.Module, width: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attention_norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.attention_norm = LayerNorm(width, elementwise_affine=False)
         self.attention = attention
-        self.mlp_norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.mlp_norm = LayerNorm(width, elementwise_affine=False)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
-    def forward(self, x: Tensor, prefix: KeyValue) -> Tensor:
+    def forward(self, x: Same, prefix: KeyValue) -> Same:
         """Action tokens (B, H, X) -> (B, H, X)."""
         x = x + self.attention(self.attention_norm(x), prefix)
         return x + self.mlp(self.mlp_norm(x))
@@ -122,6 +119,7 @@ class SmolVLACore(Backbone, nn.Module):
     """
 
     interface = "flow"
+    takes_duals = True
     last_token = "state"  # of the context
     key = "core"
     own = ("input.", "mlp.", "position", "time.", "interval.", "blocks.", "output.")
@@ -148,7 +146,7 @@ class SmolVLACore(Backbone, nn.Module):
         self.time = TimeEmbedding(expert_width, max_rad)
         self.interval = TimeEmbedding(expert_width, max_rad)
         self.mlp = nn.Sequential(
-            Linear(3 * expert_width, expert_width), nn.SiLU(), Linear(expert_width, expert_width)
+            Linear(3 * expert_width, expert_width), SiLU(), Linear(expert_width, expert_width)
         )
         self.position = nn.Parameter(0.02 * torch.randn(steps, expert_width))
         attentions = (
@@ -160,7 +158,7 @@ class SmolVLACore(Backbone, nn.Module):
         self.blocks = nn.ModuleList(
             ExpertLayer(attention, expert_width, mlp_ratio) for attention in attentions
         )
-        self.norm = nn.LayerNorm(expert_width, elementwise_affine=False)
+        self.norm = LayerNorm(expert_width, elementwise_affine=False)
         self.output = Linear(expert_width, channels)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
@@ -177,15 +175,18 @@ class SmolVLACore(Backbone, nn.Module):
         prepared = (block.attention.prepare(own) for block, own in zip(self.blocks, cached, strict=True))
         return Conditioning(tuple(prepared))
 
-    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+    def forward(self, x: Same, t: Same, r: Same, context: Conditioning) -> Same:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
-        times = (
-            torch.cat((self.time(t), self.interval(t - r)), dim=-1).unsqueeze(1).expand(-1, self.steps, -1)
-        )
-        tokens = affine(self.mlp(torch.cat((self.input(x), times), dim=-1)), None, self.position)
+        inputs = linear_map(_with_times, self.input(x), self.time(t), self.interval(t - r))
+        tokens = shifted(self.mlp(inputs), self.position)
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
             tokens = block(tokens, prefix)
         return self.output(self.norm(tokens))
+
+
+def _with_times(x: Tensor, *times: Tensor) -> Tensor:
+    """x (B, H, D) beside the times (B, D) of each, the same in all steps: (B, H, 3 D)."""
+    return torch.cat((x, *(time.unsqueeze(1).expand(-1, x.shape[1], -1) for time in times)), dim=-1)
 
 
 def _hide_last(x: Tensor) -> Tensor:

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from imfvla.nn.attention import Attention, KeyValue
+from imfvla.nn.dual import Dual, LayerNorm, Same, linear_map, shifted, silu_tangent
 from imfvla.nn.embeddings import TimeEmbedding
-from imfvla.nn.forward_mode import affine
 from imfvla.nn.linear import Linear
 from imfvla.nn.residual import History
 from imfvla.nn.sizes import LAYERS, WIDTH
@@ -48,7 +48,7 @@ class Conditioning:
         return self.map(lambda x: x.detach().to(dtype))
 
     def rows(self, index: Tensor | slice) -> "Conditioning":
-        return self.map(lambda x: x[index])
+        return self.map(lambda x: x[index] if isinstance(index, slice) else x.index_select(0, index))
 
     def tensors(self) -> tuple[Tensor, ...]:
         """All of it, in an order that `of` reads: what a graph hands from one call to the next."""
@@ -74,9 +74,21 @@ class SwiGLU(nn.Module):
         self.input = Linear(width, 2 * hidden, bias=False)
         self.output = Linear(hidden, width, bias=False)
 
-    def forward(self, x: Tensor) -> Tensor:
-        a, b = self.input(x).chunk(2, dim=-1)
-        return self.output(F.silu(a) * b)
+    def forward(self, x: Same) -> Same:
+        return self.output(gated(self.input(x)))
+
+
+def gated(x: Same) -> Same:
+    """silu(a) * b of x = (a, b): (..., 2 H) -> (..., H)."""
+    if isinstance(x, Dual):
+        return x.tape.add(gated(x.value), lambda tangent: _gated_tangent(tangent, x.fixed), x)
+    a, b = x.chunk(2, dim=-1)
+    return F.silu(a) * b
+
+
+def _gated_tangent(tangent: Tensor, x: Tensor) -> Tensor:
+    (da, db), (a, b) = tangent.chunk(2, dim=-1), x.chunk(2, dim=-1)
+    return torch.addcmul(silu_tangent(da, a) * b, F.silu(a), db)
 
 
 class Block(nn.Module):
@@ -86,12 +98,12 @@ class Block(nn.Module):
 
     def __init__(self, width: int, heads: int, mlp_ratio: float) -> None:
         super().__init__()
-        self.attention_norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.attention_norm = LayerNorm(width, elementwise_affine=False)
         self.attention = Attention(width, heads)
-        self.mlp_norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.mlp_norm = LayerNorm(width, elementwise_affine=False)
         self.mlp = SwiGLU(width, int(mlp_ratio * width))
 
-    def forward(self, history: History, prefix: KeyValue) -> None:
+    def forward(self, history: History[Same], prefix: KeyValue) -> None:
         """Adds the increments of both sublayers, whose tokens see the prefix and each other."""
         history.add(self.attention(self.attention_norm(history.read()), prefix))
         history.add(self.mlp(self.mlp_norm(history.read())))
@@ -115,6 +127,7 @@ class TransformerCore(nn.Module):
     """
 
     block: type[nn.Module] = Block
+    takes_duals = True  # a subclass with layers that take none says no
     last_token = "summary"  # of the context
 
     def __init__(
@@ -142,7 +155,7 @@ class TransformerCore(nn.Module):
         self.interval = TimeEmbedding(width, max_rad)
         self.blocks = nn.ModuleList(self.block(width, heads, mlp_ratio) for _ in range(depth))
         self.residual = residual(self.block.num_sublayers * depth, width)
-        self.norm = nn.LayerNorm(width, elementwise_affine=False)
+        self.norm = LayerNorm(width, elementwise_affine=False)
         self.output = Linear(width, patch * channels)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
@@ -173,12 +186,12 @@ class TransformerCore(nn.Module):
             history.add(block.mlp(block.mlp_norm(history.read())))
         return Conditioning(tuple(cached), self.summary(context[:, -1]))
 
-    def forward(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+    def forward(self, x: Same, t: Same, r: Same, context: Conditioning) -> Same:
         """x (B, H, A), times 0 <= r <= t <= 1 (B,), context of the same B -> (B, H, A)."""
         stack = self.average or self
         return stack.sequence(stack.output(stack.features(x, t, r, context)))
 
-    def instant(self, x: Tensor, t: Tensor, context: Conditioning) -> Tensor:
+    def instant(self, x: Same, t: Same, context: Conditioning) -> Same:
         """What the blocks of the instantaneous velocity say, r = t: x (B, H, A), t (B,) -> (B, H, A)."""
         return self.sequence(self.output(self.features(x, t, t, context)))
 
@@ -186,19 +199,24 @@ class TransformerCore(nn.Module):
         """The blocks of the average velocity take the weights of those of the instantaneous one."""
         copy_weights(self, self.average)
 
-    def features(self, x: Tensor, t: Tensor, r: Tensor, context: Conditioning) -> Tensor:
+    def features(self, x: Same, t: Same, r: Same, context: Conditioning) -> Same:
         """What the output layers read of each action token: (B, K, D)."""
-        tokens = affine(self.patches(x), None, self.position + context.summary.unsqueeze(1))
-        times = torch.stack((self.time(t), self.interval(t - r)), dim=1)
-        history = self.residual.begin(torch.cat((times, tokens), dim=1))
+        tokens = shifted(self.patches(x), self.position + context.summary.unsqueeze(1))
+        sequence = linear_map(_in_a_row, self.time(t), self.interval(t - r), tokens)
+        history = self.residual.begin(sequence)
         for block, prefix in zip(self.blocks, context.blocks, strict=True):
             block(history, prefix)
         return self.norm(history.readout()[:, 2:])
 
-    def patches(self, x: Tensor) -> Tensor:
+    def patches(self, x: Same) -> Same:
         """Tokens (B, K, D) of a sequence (B, H, A)."""
-        return self.input(x.unflatten(1, (-1, self.patch)).flatten(2))
+        return self.input(linear_map(lambda x: x.unflatten(1, (-1, self.patch)).flatten(2), x))
 
-    def sequence(self, patches: Tensor) -> Tensor:
+    def sequence(self, patches: Same) -> Same:
         """The sequence (B, H, A) whose patches are (B, K, patch * A)."""
-        return patches.unflatten(-1, (self.patch, self.channels)).flatten(1, 2)
+        return linear_map(lambda x: x.unflatten(-1, (self.patch, self.channels)).flatten(1, 2), patches)
+
+
+def _in_a_row(time: Tensor, interval: Tensor, tokens: Tensor) -> Tensor:
+    """(B, D), (B, D) and (B, K, D) -> (B, 2 + K, D)."""
+    return torch.cat((time.unsqueeze(1), interval.unsqueeze(1), tokens), dim=1)

@@ -17,6 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.nn.dual import Dual, Same
+
 
 @dataclass(frozen=True, slots=True)
 class Known:
@@ -79,8 +81,11 @@ class GivenContext:
     def detach(self, dtype: torch.dtype) -> "GivenContext":
         return GivenContext(self.context.detach(dtype), self.actions.to(dtype), self.given)
 
-    def put(self, x: Tensor) -> Tensor:
+    def put(self, x: Same) -> Same:
         """x (B, Tp, A) with the given actions in their places, which a derivative along x does not reach."""
+        if isinstance(x, Dual):
+            given = self.given[x.tape.rows]
+            return x.tape.add(self.put(x.value), lambda tangent: tangent.masked_fill(given, 0), x)
         return torch.where(self.given, self.actions.to(x.dtype), x)
 
 
@@ -89,9 +94,10 @@ class GivenCore:
 
     def __init__(self, core: nn.Module) -> None:
         self._core = core
+        self.takes_duals = getattr(core, "takes_duals", False)
 
-    def __call__(self, x: Tensor, t: Tensor, r: Tensor, context: GivenContext) -> Tensor:
+    def __call__(self, x: Same, t: Same, r: Same, context: GivenContext) -> Same:
         return self._core(context.put(x), t, r, context.context)
 
-    def instant(self, x: Tensor, t: Tensor, context: GivenContext) -> Tensor:
+    def instant(self, x: Same, t: Same, context: GivenContext) -> Same:
         return self._core.instant(context.put(x), t, context.context)

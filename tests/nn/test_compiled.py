@@ -1,10 +1,10 @@
 import copy
+import os
 
 import pytest
 import torch
 from small_policy import batch, config, loss, policy
 
-from imfvla.errors import UserError
 from imfvla.nn import compiled
 
 
@@ -14,9 +14,10 @@ def forget_compiled_code():
     torch.compiler.reset()
 
 
-def shallow_policy():
+def shallow_policy(v_from="boundary"):
     """One block, since compiling takes seconds for each."""
-    return policy(core=config()["core"] | {"depth": 1})
+    core = config()["core"] | {"depth": 1, "velocity_head": v_from == "head"}
+    return policy(core=core, generator=config()["generator"] | {"v_from": v_from})
 
 
 def compiled_copy(made, backend):
@@ -36,8 +37,9 @@ def test_a_compiled_policy_predicts_what_the_eager_one_does():
         assert (twin.predict(data.obs, noise, nfe) - expected).abs().max() < 1e-4
 
 
-def test_a_compiled_loss_has_the_gradients_of_the_eager_one():
-    made, data = shallow_policy(), batch()
+@pytest.mark.parametrize("v_from", ["boundary", "head"])
+def test_a_compiled_loss_has_the_gradients_of_the_eager_one(v_from):
+    made, data = shallow_policy(v_from), batch()
     twin = compiled_copy(made, "aot_eager")
     losses = [loss(made, data), loss(twin, data)]
     torch.testing.assert_close(losses[1], losses[0])
@@ -48,7 +50,21 @@ def test_a_compiled_loss_has_the_gradients_of_the_eager_one():
         torch.testing.assert_close(found.grad, expected.grad, rtol=1e-4, atol=1e-6, msg=name)
 
 
-def test_compiling_without_a_compiler_is_refused(monkeypatch):
+def test_without_a_compiler_a_policy_stays_as_it_is_and_a_line_says_so(monkeypatch, caplog):
     monkeypatch.setattr(compiled.shutil, "which", lambda name: None)
-    with pytest.raises(UserError, match=r"needs a C\+\+ compiler"):
-        compiled.compile_parts(policy())
+    made = policy()
+    compiled.compile_parts(made)
+    assert "condition" not in vars(made.core)
+    assert "no C++ compiler was found" in caplog.text
+
+
+def test_compiled_code_lies_in_the_users_cache_unless_the_user_says_where(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(compiled, "has_compiler", lambda: True)
+    chosen = str(tmp_path / "chosen")
+    monkeypatch.setenv(compiled.CACHE, chosen)
+    compiled.compile_parts(policy())
+    assert os.environ[compiled.CACHE] == chosen
+    monkeypatch.delenv(compiled.CACHE)
+    compiled.compile_parts(policy())
+    assert os.environ[compiled.CACHE] == str(tmp_path / "imfvla" / "inductor")
