@@ -37,6 +37,9 @@ class Decision:
     jump: float | None = (
         None  # distance from the last chunk over the steps left of both, as a share of the actions' ranges
     )
+    imitate: bool | None = (
+        None  # whether a policy should learn what is done here; None: nothing is said, so it should
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,16 @@ class StoredEpisode:
     first_row: int  # of state and action
     first_frame: int  # of images
     image_steps: np.ndarray  # int64 (K,)  steps of its frames, within the episode
+    skipped: tuple[
+        tuple[int, int], ...
+    ] = ()  # [first, end) of the steps that are not to be imitated, ascending
+
+    @property
+    def learned(self) -> tuple[tuple[int, int], ...]:
+        """[first, end) of the other steps, ascending."""
+        edges = [0, *(step for span in self.skipped for step in span), self.num_steps]
+        spans = zip(edges[::2], edges[1::2], strict=True)
+        return tuple((first, end) for first, end in spans if first < end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +86,7 @@ class FrameStore:
             known: dict[tuple[str, ...], tuple[str, ...]] = {}  # thousands of episodes share their sentences
             for entry in meta["episodes"]:
                 steps = image_steps[frame : frame + entry.pop("num_frames")]
+                entry["skipped"] = tuple(map(tuple, entry.get("skipped", ())))
                 instructions = tuple(entry["instructions"])
                 entry["instructions"] = known.setdefault(instructions, instructions)
                 episodes.append(StoredEpisode(first_row=row, first_frame=frame, image_steps=steps, **entry))
@@ -83,6 +94,7 @@ class FrameStore:
             if not len(state) == len(action) == row or len(image_steps) != frame:
                 raise ValueError("its arrays differ in length")
             _check_arrays(state, action, image_steps, episodes)
+            _check_skipped(episodes)
         except Exception as error:  # a damaged byte can raise anything
             raise UserError(
                 f"Frame store {path} cannot be read ({error}): delete it, or choose another folder with "
@@ -156,6 +168,14 @@ def _check_arrays(
     lengths = np.repeat([e.num_steps for e in episodes], [len(e.image_steps) for e in episodes])
     if (image_steps < 0).any() or (image_steps >= lengths).any():
         raise ValueError("image_steps are not all of its episodes' steps")
+
+
+def _check_skipped(episodes: Sequence[StoredEpisode]) -> None:
+    """Raises ValueError where steps that are not to be imitated are not in order, or not of their episode."""
+    for episode in episodes:
+        edges = [step for span in episode.skipped for step in span]
+        if edges != sorted(set(edges)) or (edges and edges[-1] > episode.num_steps):
+            raise ValueError(f"{episode.name} skips {episode.skipped} of {episode.num_steps} steps")
 
 
 def _digest_of_episodes(meta: Mapping[str, Any]) -> str:

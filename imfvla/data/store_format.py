@@ -3,7 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 from imfvla.errors import UserError
 from imfvla.options import at_most, of_length, within, within_length
@@ -25,6 +25,8 @@ class EpisodeEntry(TypedDict):
     instructions: Annotated[list[Annotated[str, at_most(10_000)]], within_length(1, 10_000)]
     num_steps: Annotated[int, within(1, 10**7)]
     num_frames: Annotated[int, within(0, 10**7)]
+    # [first, end) of the steps that are not to be imitated, ascending; absent where there are none
+    skipped: NotRequired[list[Annotated[list[Annotated[int, within(0, 10**7)]], of_length(2)]]]
 
 
 class StoreMeta(TypedDict):

@@ -91,6 +91,8 @@ def _write_arrays(
                 "num_steps": len(episode.state),
                 "num_frames": len(episode.image_steps),
             }
+            if episode.imitate is not None and not episode.imitate.all():
+                entry["skipped"] = spans_without(episode.imitate)
             entries.append(entry)
             steps.append(episode.image_steps)
             states.append(episode.state)
@@ -102,6 +104,12 @@ def _write_arrays(
     meta = with_checksums(meta | {"episodes": entries}, part, ARRAYS)
     (part / "meta.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
     return meta
+
+
+def spans_without(flags: np.ndarray) -> list[list[int]]:
+    """[first, end) of each run of false in flags, bool (T,)."""
+    changes = np.flatnonzero(np.diff(flags, prepend=True, append=True))
+    return changes.reshape(-1, 2).tolist()
 
 
 def _save(path: Path, array: np.ndarray) -> None:

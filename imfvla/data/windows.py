@@ -25,6 +25,9 @@ class Windows:
     saw them; episodes with gaps would leave only the first step of each episode and are refused with a
     UserError.
 
+    A step that is not to be imitated is no decision, and a chunk that reaches such a step ends before it, as it ends
+    with its episode.
+
     With `paraphrases` an item's sentence is drawn from the recorded one and its paraphrases, otherwise it is the
     recorded one. `episodes` are those of the store that count, by number; None for all.
     """
@@ -83,19 +86,27 @@ class Windows:
         ]
 
     def statistics(self) -> Statistics:
-        """Of states and actions over all control steps, with frames or without; of displacements over all windows."""
+        """Of states and actions over all control steps to be imitated, with frames or without.
+
+        Of displacements over all windows.
+        """
         store, running = self.store, RunningStatistics(self.robot.origin, self.horizon.pred)
         firsts = np.searchsorted(self._frame, self._first_frame[self.chosen])
         ends = np.append(firsts[1:], len(self._frame))
         for number, first, end in zip(self.chosen, firsts, ends, strict=True):
             episode = store.episodes[number]
-            rows = slice(episode.first_row, episode.first_row + episode.num_steps)
-            running.add(store.state[rows], store.action[rows], store.image_steps[self._frame[first:end]])
+            decisions = store.image_steps[self._frame[first:end]]
+            for begin, stop in episode.learned:
+                rows = slice(episode.first_row + begin, episode.first_row + stop)
+                inside = decisions[(begin <= decisions) & (decisions < stop)] - begin
+                running.add(store.state[rows], store.action[rows], inside)
         return running.result()
 
     def _followed(self, episodes: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Actions (B, Tp, A) and valid (B, Tp) of the chunks decided at these steps of these episodes (B,)."""
-        after, valid = self.horizon.action_steps(steps, self._num_steps[episodes])
+        row = self._first_row[episodes] + steps
+        end = self._ends[np.searchsorted(self._ends, row, side="right")] - self._first_row[episodes]
+        after, valid = self.horizon.action_steps(steps, end)
         return self.store.action[self._first_row[episodes, None] + after], valid
 
     def _episode_of(self, frame: np.ndarray) -> np.ndarray:
@@ -107,7 +118,8 @@ class Windows:
         episodes = self.store.episodes
         self._first_frame = np.array([one.first_frame for one in episodes])  # (episodes,)
         self._first_row = np.array([one.first_row for one in episodes])  # (episodes,)
-        self._num_steps = np.array([one.num_steps for one in episodes])  # (episodes,)
+        # rows at which steps to be imitated end: those of an episode, or what comes before some that are not
+        self._ends = np.array([one.first_row + end for one in episodes for _, end in one.learned])
         found = [self._decidable(number) for number in self.chosen]
         self._frame = np.concatenate([np.empty(0, np.int64), *found])  # (W,)  rows of store.images
         if not len(self._frame) or (self.horizon.obs > 1 and not self.store.image_steps[self._frame].any()):
@@ -124,7 +136,10 @@ class Windows:
         seen = self.horizon.observed_steps(episode.image_steps)
         places = own[:, None] + seen - episode.image_steps[:, None]  # of their frames, if none is missing
         has_all = (places >= 0) & (episode.image_steps[np.maximum(places, 0)] == seen)
-        return episode.first_frame + own[has_all.all(axis=1)]
+        decided = has_all.all(axis=1)
+        for first, end in episode.skipped:
+            decided &= (episode.image_steps < first) | (end <= episode.image_steps)
+        return episode.first_frame + own[decided]
 
     def _index_instructions(self, paraphrases: bool) -> None:
         sentences: list[str] = []

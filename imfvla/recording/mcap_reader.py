@@ -31,6 +31,9 @@ class Episode:
     state: np.ndarray  # float32 (T, S)  before the action
     action: np.ndarray  # float32 (T, A)  clean: what a policy should learn
     executed: np.ndarray  # float32 (T, A)
+    imitate: (
+        np.ndarray | None
+    )  # bool (T,)  whether a policy should learn the action; None: it should learn all
     reward: np.ndarray  # float32 (T,)  after the action
     stage: np.ndarray  # int64 (T,)  after the action
     chunks: Mapping[int, np.ndarray]  # step -> float32 (Tp, A), where the policy replanned
@@ -85,6 +88,11 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         part: _channels(path, messages.ACTION, rows, action, part)
         for part in (messages.CLEAN, messages.EXECUTED)
     }
+    imitate = [parse_json(text)["imitate"] for _, text in rows.get(messages.IMITATE, [])]
+    if len(imitate) not in (0, num_steps) or any(type(said) is not bool for said in imitate):
+        raise ValueError(
+            f"{len(imitate)} messages of {messages.IMITATE} for {num_steps} steps, or one without a flag"
+        )
     rewards = [parse_json(text) for _, text in rows.get(messages.REWARD, [])]
     _check_kinds("reward", [reward["reward"] for reward in rewards], NUMBERS)
     _check_kinds("stage", [reward["stage"] for reward in rewards], (int,))
@@ -109,6 +117,7 @@ def _parse(path: Path, data: bytes, images: bool | Collection[str]) -> Episode:
         state=states,
         action=actions[messages.CLEAN],
         executed=actions[messages.EXECUTED],
+        imitate=np.array(imitate) if imitate else None,
         reward=np.array([reward["reward"] for reward in rewards], np.float32),
         stage=np.array([reward["stage"] for reward in rewards], np.int64),
         chunks={chunk["step"]: _chunk(path, chunk, action) for chunk in chunks},

@@ -153,6 +153,8 @@ class McapSink:
             messages.EXECUTED: self._action.tree(decision.executed),
         }
         self._write(messages.ACTION, self._action_schema, action)
+        if decision.imitate is not None:
+            self._write(messages.IMITATE, schemas.IMITATE, {"imitate": bool(decision.imitate)})
         if decision.chunk is not None:
             chunk = {
                 "step": step.index,

@@ -38,6 +38,7 @@ ACTION = "/robot/action"
 CLEAN, EXECUTED = "clean", "executed"  # parts of an action's message
 CHUNK = "/policy/chunk"
 INFERENCE = "/policy/inference_ms"
+IMITATE = "/expert/imitate"
 REWARD = "/episode/reward"
 LOG = "/episode/log"
 TRANSFORMS = "/tf"

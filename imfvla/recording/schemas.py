@@ -79,4 +79,5 @@ ACTION_CHUNK = object_of(
     "imfvla.ActionChunk", step=INTEGER, names=_array(TEXT), actions=_array(_array(NUMBER))
 )
 REWARD = object_of("imfvla.Reward", reward=NUMBER, stage=INTEGER)
+IMITATE = object_of("imfvla.Imitate", imitate=BOOLEAN)
 INFERENCE = object_of("imfvla.Inference", ms=NUMBER)

@@ -25,6 +25,9 @@ class EpisodeArrays:
     images: Mapping[
         str, np.ndarray
     ]  # view -> uint8 (K, H, W, 3), at the size of its camera; empty if not asked for
+    imitate: np.ndarray | None = (
+        None  # bool (T,)  whether to learn what is done at a step; None: at every step
+    )
 
 
 class EpisodeSource(Protocol):

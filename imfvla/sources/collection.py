@@ -32,7 +32,7 @@ OF_DEMONSTRATIONS = Limit(
     lambda seed: any(seed in band for band in DEMONSTRATION_SEEDS),
 )
 # What folders were recorded with before a setting had a name.
-LATER_SETTINGS = {"dwell": 0}
+LATER_SETTINGS = {"dwell": 0, "recoveries": 0}
 log = logging.getLogger(__name__)
 
 
@@ -200,14 +200,15 @@ class _Log:
         is_empty = next(directory.glob("episode-*.mcap"), None) is None
         if self._path.exists():
             found, failed = self._read()
-            differing = [key for key, wanted in self._settings.items() if found.get(key) != wanted]
+            settings = LATER_SETTINGS | self._settings
+            differing = [key for key, wanted in settings.items() if found.get(key) != wanted]
             if not differing:
                 self.failed = failed
                 return
             if not is_empty:
                 key = differing[0]
                 raise UserError(
-                    f"{directory} was recorded with {key}={found.get(key)!r}, but {self._settings[key]!r} is wanted; "
+                    f"{directory} was recorded with {key}={found.get(key)!r}, but {settings[key]!r} is wanted; "
                     f"{self._remedy}."
                 )
         elif not is_empty:

@@ -54,6 +54,7 @@ class ExpertOptions:
     noise: float
     hold: int
     dwell: int
+    recoveries: float = 0  # older than runs without it
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ class BimanualSettings:
     noise: float
     hold: int
     dwell: int
+    recoveries: float
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -74,14 +76,16 @@ class BimanualSettings:
     def folder(self) -> str:
         height, width = self.image_size
         waiting = f"-dwell{self.dwell}" if self.dwell else ""
-        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}-{height}x{width}"
+        missing = f"-recoveries{self.recoveries:g}" if self.recoveries else ""
+        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}-{height}x{width}"
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         return (self.image_size,) * len(self.views)
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+        """Without `recoveries` where there are none: such recordings have the bytes that they had before."""
+        return {key: value for key, value in asdict(self).items() if key != "recoveries" or value}
 
     def build(self) -> tuple[Environment, Actor]:
         from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
@@ -93,7 +97,12 @@ class BimanualSettings:
             }
         )
         return env, make_expert(
-            self.task, modes=self.modes, noise=self.noise, hold=self.hold, dwell=self.dwell
+            self.task,
+            modes=self.modes,
+            noise=self.noise,
+            hold=self.hold,
+            dwell=self.dwell,
+            recoveries=self.recoveries,
         )
 
 

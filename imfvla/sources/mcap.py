@@ -66,6 +66,7 @@ class McapSource:
             action=episode.action,
             image_steps=episode.image_steps,
             images=episode.images,
+            imitate=episode.imitate,
         )
 
     def num_frames(self, index: int) -> int:

@@ -61,7 +61,8 @@ class McapWriter:
                 images = {}
                 if index in taken:
                     images = {view: frames[taken[index]] for view, frames in episode.images.items()}
-                decision = Decision(action, action, images)
+                imitate = None if episode.imitate is None else bool(episode.imitate[index])
+                decision = Decision(action, action, images, imitate=imitate)
                 sink.step(NO_WORLD, Step(index, index / robot.control_hz, state, decision, 0.0, 0))
             sink.end(
                 EpisodeResult(

@@ -29,6 +29,10 @@ def check_episode(episode: EpisodeArrays, robot: RobotSpec, views: Collection[st
                 "finite",
                 f"{values[step, channel]} at step {step}",
             )
+    if (flags := episode.imitate) is not None:
+        is_right = flags.dtype == bool and flags.shape == (steps,) and flags.any()
+        wanted = f"bool of shape {(steps,)}, true at one step at least"
+        _require(episode, bool(is_right), "imitate", wanted, f"{flags.dtype} of shape {flags.shape}")
     _require(episode, bool(episode.instructions), "instructions", "at least one sentence", "none")
     taken = np.asarray(episode.image_steps)
     inside = taken.ndim == 1 and (taken >= 0).all() and (taken < steps).all() and (np.diff(taken) > 0).all()

@@ -60,11 +60,13 @@ class Prop(composer.Entity):
 class Bar(Prop):
     """A square bar along x. Both ends carry the same cap, so that half a turn makes no visible difference."""
 
-    def _build(self, name: str, length: float, color: Color = ORANGE, cap: float = 0.02) -> None:
+    def _build(
+        self, name: str, length: float, color: Color = ORANGE, cap: float = 0.02, width: float = BAR_WIDTH
+    ) -> None:
         super()._build(name)
         self.length = length
-        self.rest_height = BAR_WIDTH / 2
-        half = BAR_WIDTH / 2
+        half = width / 2
+        self.rest_height = half
         self._box("bar", (0, 0, 0), (length / 2, half, half), color)
         for sign in (-1, 1):
             skin = half + 3e-4

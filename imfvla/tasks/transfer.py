@@ -3,9 +3,11 @@
 from dm_control import mjcf
 
 from imfvla.tasks.bimanual import BimanualTask, StartRange
-from imfvla.tasks.props import Bar
+from imfvla.tasks.props import BAR_WIDTH, Bar
 
 BAR_LENGTH = 0.22
+# A thin bar is held only where fingers close at most 8 mm above the expert's height, which 16 mm do around a thick one.
+WIDTHS = {"easy": BAR_WIDTH, "default": BAR_WIDTH, "hard": 0.016}
 RANGES = {
     "easy": (StartRange((0.14, 0.18), (-0.02, 0.02), (-0.1, 0.1))),
     "default": (StartRange((0.04, 0.24), (-0.125, 0.125), (-0.55, 0.55))),
@@ -20,7 +22,7 @@ class TransferTask(BimanualTask):
     name = "transfer"
 
     def __init__(self, variant: str) -> None:
-        super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH)})
+        super().__init__(variant, {"bar": Bar("bar", BAR_LENGTH, width=WIDTHS[variant])})
         self.ranges = {"bar": RANGES[variant]}
 
     def stage(self, physics: mjcf.Physics) -> int:

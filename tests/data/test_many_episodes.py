@@ -40,33 +40,56 @@ class Gaps(MemorySource):
             )
 
 
+class Failures(Gaps):
+    """The same, with steps that are not to be imitated: at the beginning, at the end, and in the middle."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        skipped = ({*range(9)}, {0, 4, 5, 6, 13}, {3}, {*range(18, 31)}, set(), {2, 3, 9})
+        for number, (episode, steps) in enumerate(zip(self.episodes, skipped, strict=True)):
+            flags = np.array([step not in steps for step in range(len(episode.state))])
+            self.episodes[number] = replace(episode, imitate=flags)
+
+
+@pytest.fixture(scope="module", params=[Gaps, Failures])
+def source(request: pytest.FixtureRequest) -> Gaps:
+    return request.param()
+
+
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> FrameStore:
+def store(source, tmp_path_factory) -> FrameStore:
     path = tmp_path_factory.mktemp("gaps") / "store"
-    return FrameStore.build(Gaps(), path, (8, 8), names_of(ROBOT.cameras))
+    return FrameStore.build(source, path, (8, 8), names_of(ROBOT.cameras))
+
+
+def flags_of(source: Gaps, number: int) -> np.ndarray:
+    """bool (T,): which steps of an episode are to be imitated."""
+    episode = source.episodes[number]
+    return np.ones(len(episode.state), bool) if episode.imitate is None else episode.imitate
 
 
 class Held:
     """The definition: one window after the other, all rows held in memory."""
 
-    def __init__(self, store: FrameStore, horizon: Horizon, paraphrases: bool, chosen) -> None:
+    def __init__(self, source: Gaps, store: FrameStore, horizon: Horizon, paraphrases: bool, chosen) -> None:
         self.store = store
         episodes, steps, frames, observed, followed, valid = [], [], [], [], [], []
         for number in sorted(range(len(store.episodes)) if chosen is None else chosen):
-            episode = store.episodes[number]
+            episode, flags = store.episodes[number], flags_of(source, number)
             frame_at = np.full(episode.num_steps, -1)
             frame_at[episode.image_steps] = episode.first_frame + np.arange(len(episode.image_steps))
             for step in episode.image_steps.tolist():
                 seen = np.maximum(np.arange(step - horizon.obs + 1, step + 1), 0)
-                if (frame_at[seen] < 0).any():
+                if (frame_at[seen] < 0).any() or not flags[step]:
                     continue
                 after = np.arange(step, step + horizon.pred)
+                end = next((later for later in range(step, len(flags)) if not flags[later]), len(flags))
                 episodes.append(number)
                 steps.append(step)
                 frames.append(frame_at[seen])
                 observed.append(episode.first_row + seen)
-                followed.append(episode.first_row + np.minimum(after, episode.num_steps - 1))
-                valid.append(after < episode.num_steps)
+                followed.append(episode.first_row + np.minimum(after, end - 1))
+                valid.append(after < end)
         self.episodes, self.steps = np.array(episodes), np.array(steps)
         self.frames, self.observed, self.followed = np.array(frames), np.array(observed), np.array(followed)
         self.valid = np.array(valid)
@@ -92,10 +115,10 @@ def parts(batch) -> tuple[torch.Tensor, ...]:
 @pytest.mark.parametrize("chosen", CHOSEN)
 @pytest.mark.parametrize("paraphrases", [True, False])
 @pytest.mark.parametrize("horizon", HORIZONS)
-def test_windows_and_batches_are_those_of_an_index_held_whole(store, horizon, paraphrases, chosen):
+def test_windows_and_batches_are_those_of_an_index_held_whole(source, store, horizon, paraphrases, chosen):
     horizon = Horizon(*horizon)
     windows = Windows(store, horizon, ROBOT, paraphrases=paraphrases, episodes=chosen)
-    held = Held(store, horizon, paraphrases, chosen)
+    held = Held(source, store, horizon, paraphrases, chosen)
     assert len(windows) == len(held.steps)
     episodes, steps = windows.decisions(np.arange(len(windows)))
     np.testing.assert_array_equal(episodes, held.episodes)
@@ -113,10 +136,10 @@ def test_windows_and_batches_are_those_of_an_index_held_whole(store, horizon, pa
         np.testing.assert_array_equal(valid, found[4])
 
 
-def test_a_loader_hands_out_the_same_batches(store):
+def test_a_loader_hands_out_the_same_batches(source, store):
     windows, held = (
         Windows(store, Horizon(2, 8, 4), ROBOT),
-        Held(store, Horizon(2, 8, 4), True, None),
+        Held(source, store, Horizon(2, 8, 4), True, None),
     )
     with Loader(windows, ResumableSampler(len(windows), 6, seed=1), augment=Augmentation()) as loader:
         for number in range(4):
@@ -138,15 +161,35 @@ def assert_close(found: Statistics, wanted: Statistics) -> None:
 
 @pytest.mark.parametrize("chosen", CHOSEN)
 @pytest.mark.parametrize("horizon", [*HORIZONS, (1, 100, 1)])
-def test_statistics_are_those_of_all_displacements_at_once(store, horizon, chosen):
-    held = Held(store, Horizon(*horizon), True, chosen)
+def test_statistics_are_those_of_all_displacements_at_once(source, store, horizon, chosen):
+    held = Held(source, store, Horizon(*horizon), True, chosen)
     numbers = range(len(store.episodes)) if chosen is None else chosen
     rows = np.concatenate(
-        [np.arange(one.num_steps) + one.first_row for one in map(store.episodes.__getitem__, numbers)]
+        [store.episodes[number].first_row + np.flatnonzero(flags_of(source, number)) for number in numbers]
     )
     displaced = store.action[held.followed] - store.state[held.observed[:, -1:]][..., ROBOT.origin]
     wanted = Statistics.of(store.state[rows], store.action[rows], displaced, held.valid)
     assert_close(Windows(store, Horizon(*horizon), ROBOT, episodes=chosen).statistics(), wanted)
+
+
+def test_what_is_not_to_be_imitated_enters_neither_a_batch_nor_the_statistics(tmp_path):
+    """Neither actions nor states at such steps: with others, all batches and normalisers are the same."""
+    batches, statistics, rng = [], [], np.random.default_rng(0)
+    for name, scale in (("as recorded", 0), ("other", 100)):
+        source = Failures()
+        for number, episode in enumerate(source.episodes):
+            bad = ~episode.imitate[:, None] * scale
+            values = {
+                key: (found + bad * rng.normal(size=found.shape)).astype(np.float32)
+                for key, found in (("state", episode.state), ("action", episode.action))
+            }
+            source.episodes[number] = replace(episode, **values)
+        store = FrameStore.build(source, tmp_path / name, (8, 8), names_of(ROBOT.cameras))
+        windows = Windows(store, Horizon(1, 8, 4), ROBOT)
+        batches.append(parts(windows.batch(np.arange(len(windows)), np.random.default_rng(0))))
+        statistics.append(windows.statistics().to_json())
+    assert all(torch.equal(one, other) for one, other in zip(*batches, strict=True))
+    assert statistics[0] == statistics[1]
 
 
 @pytest.mark.parametrize("far", [0.0, 1000.0])

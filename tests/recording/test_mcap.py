@@ -153,6 +153,24 @@ def test_numbers_that_are_not_finite_come_back(tmp_path, scene):
     assert np.isnan(read_episode(tmp_path / "a.mcap").chunks[0]).all()
 
 
+def test_steps_that_are_not_to_be_imitated_come_back_and_are_no_topic_where_nothing_is_said(tmp_path, scene):
+    said = (False, False, True, True, False, True)
+    episode = [
+        replace(step, decision=replace(step.decision, imitate=flag))
+        for step, flag in zip(steps(), said, strict=True)
+    ]
+    record(tmp_path / "said.mcap", scene, episode)
+    np.testing.assert_array_equal(read_episode(tmp_path / "said.mcap").imitate, said)
+    record(tmp_path / "unsaid.mcap", scene, steps())
+    assert read_episode(tmp_path / "unsaid.mcap").imitate is None
+    assert b"/expert/imitate" in (tmp_path / "said.mcap").read_bytes()
+    assert b"/expert/imitate" not in (tmp_path / "unsaid.mcap").read_bytes()
+    episode[2] = replace(episode[2], decision=replace(episode[2].decision, imitate=None))
+    record(tmp_path / "gap.mcap", scene, episode)
+    with pytest.raises(UserError, match=r"gap\.mcap .*5 messages of /expert/imitate for 6 steps"):
+        read_episode(tmp_path / "gap.mcap")
+
+
 def test_lossy_frames_are_jpeg_and_close(tmp_path, scene):
     smooth = np.linspace(0, 255, 16 * 24 * 3).reshape(16, 24, 3).astype(np.uint8)
     episode = steps(1)

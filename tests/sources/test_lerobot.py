@@ -311,6 +311,7 @@ def test_an_error_or_no_episode_leaves_nothing(tmp_path):
         replace(good, action=good.action[:, :2]),
         replace(good, state=np.full_like(good.state, np.nan)),
         replace(good, image_steps=good.image_steps + 1),
+        replace(good, imitate=np.arange(len(good.state)) > 1),
     ]
     for made in bad:
         with pytest.raises(UserError, match="made_0"):

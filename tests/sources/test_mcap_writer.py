@@ -12,7 +12,9 @@ from imfvla.sources.mcap_writer import McapWriter
 
 
 def test_recordings_keep_everything_that_an_episode_has(tmp_path):
-    made = replace(episode(1, 9, every=2), instructions=("put it there", "place it"))
+    made = replace(
+        episode(1, 9, every=2), instructions=("put it there", "place it"), imitate=np.arange(9) > 3
+    )
     with McapWriter(tmp_path / "new", ROBOT) as writer:
         writer.add(episode(0, 4))
         writer.add(made)
@@ -25,6 +27,8 @@ def test_recordings_keep_everything_that_an_episode_has(tmp_path):
     assert np.array_equal(read.state, made.state)
     assert np.array_equal(read.action, made.action)
     assert np.array_equal(read.executed, made.action)
+    assert np.array_equal(read.imitate, made.imitate)
+    assert read_episode(files[0]).imitate is None
     assert np.allclose(read.time_s, np.arange(9) / ROBOT.control_hz)
     assert np.array_equal(read.image_steps, made.image_steps)
     for view, frames in made.images.items():

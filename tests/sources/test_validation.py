@@ -45,6 +45,12 @@ def test_what_fits_passes():
             r"image_steps must be ascending steps below 20, found \[0, 2, 2\]",
         ),
         ({"image_steps": np.array([0, 99])}, "image_steps must be ascending steps below 20"),
+        ({"imitate": np.ones(20, int)}, r"imitate must be bool of shape \(20,\).*found int64"),
+        (
+            {"imitate": np.ones(19, bool)},
+            r"imitate must be bool of shape \(20,\).*found bool of shape \(19,\)",
+        ),
+        ({"imitate": np.zeros(20, bool)}, "imitate must be bool .*true at one step at least"),
         ({"images": {"camera_0": EPISODE.images["camera_0"]}}, "camera_1 must be recorded, found camera_0"),
         (
             {"images": EPISODE.images | {"camera_1": EPISODE.images["camera_0"]}},

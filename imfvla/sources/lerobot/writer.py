@@ -162,6 +162,15 @@ class LeRobotWriter:
                 raise misfit(
                     episode.name, key, f"finite, of shape (steps, {width})", f"{values.shape}", "leave it out"
                 )
+        if episode.imitate is not None and not episode.imitate.all():
+            skipped = f"{np.sum(~episode.imitate)} of {len(episode.state)} that are not"
+            raise misfit(
+                episode.name,
+                "steps",
+                "all to be imitated, since this format marks none",
+                skipped,
+                "leave it out",
+            )
         for camera in self._robot.cameras:
             frames = episode.images.get(camera.name)
             shape = (len(episode.image_steps), camera.height, camera.width, 3)

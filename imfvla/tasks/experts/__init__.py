@@ -6,6 +6,9 @@ from imfvla.tasks.experts.base import Expert
 __all__ = ["Expert", "make_expert"]
 
 
-def make_expert(name: str, *, modes: int, noise: float, hold: int, dwell: int) -> Expert:
+def make_expert(
+    name: str, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0
+) -> Expert:
     """The expert of the task `name`; see `Expert` for the rest. UserError on an unknown name."""
-    return class_at(entry_of(name).expert)(modes=modes, noise=noise, hold=hold, dwell=dwell)
+    made = class_at(entry_of(name).expert)
+    return made(modes=modes, noise=noise, hold=hold, dwell=dwell, recoveries=recoveries)

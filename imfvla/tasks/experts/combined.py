@@ -13,10 +13,11 @@ from imfvla.tasks.experts.transfer import TransferExpert
 class CombinedExpert:
     """An `episode.Actor` with the arguments of `Expert`."""
 
-    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int) -> None:
+    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0) -> None:
+        shared = {"modes": modes, "noise": noise, "hold": hold, "recoveries": recoveries}
         self._experts = {
-            "socket": SocketExpert(modes=modes, noise=noise, hold=hold, dwell=0),
-            "transfer": TransferExpert(modes=modes, noise=noise, hold=hold, dwell=dwell),
+            "socket": SocketExpert(**shared, dwell=0),
+            "transfer": TransferExpert(**shared, dwell=dwell),
         }
         self._expert = self._experts["socket"]
 

@@ -7,6 +7,7 @@ import numpy as np
 from imfvla.tasks.bimanual import SIDES, Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.hand import OPEN, lift
 from imfvla.tasks.kinematics import about_z, rotation_vector
 
 GRASPS = {"left": (-0.075, -0.055), "right": (0.055, 0.075)}  # along the bar, from its middle
@@ -16,6 +17,7 @@ IN_PLACE, IN_PLACE_ANGLE = 0.012, 0.08  # m, rad
 
 class EitherArmExpert(Expert):
     task_name = "either_arm"
+    misses = (("left",), ("right",), ("left", "right"))
     dwells = True
 
     def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
@@ -46,7 +48,7 @@ class EitherArmExpert(Expert):
         )
         if not (both or raised):
             for side, hand in self.hands.items():
-                self.pick(hand, bar, np.array([self.grasps[side], 0, 0]))
+                self.pick(hand, bar, np.array([self.grasps[side], 0, 0]), self.meeting)
             return
         self._in_place += bool(
             both
@@ -57,7 +59,7 @@ class EitherArmExpert(Expert):
             if side == self.giver and self._in_place > self.wait:
                 gave = meeting.position + np.array([self.grasps[side], 0, 0]) + RETREAT[side]
                 rest = Pose(gave, about_z(self.turn[side] * np.pi / 2))
-                hand.move(rest if hand.opening > 0.6 else hand.pose, 1.0, self.speed)
+                hand.move(rest if hand.opening > OPEN else hand.pose, 1.0, self.speed)
             else:
-                goal = meeting if self._in_place > self.wait else self.lift(bar, meeting, rest_height)
+                goal = meeting if self._in_place > self.wait else lift(bar, meeting, rest_height)
                 hand.move(hand.carry(bar, goal), 0.0, self.speed)

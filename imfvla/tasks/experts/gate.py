@@ -6,7 +6,8 @@ import numpy as np
 
 from imfvla.tasks.bimanual import Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
-from imfvla.tasks.experts.base import CARROT_S, Expert
+from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.hand import CARROT_S, lift
 from imfvla.tasks.gate import BAR_LENGTH
 from imfvla.tasks.kinematics import about_z, rotation_vector
 from imfvla.tasks.props import BAR_WIDTH, POST_HEIGHT, POST_RADIUS
@@ -45,19 +46,19 @@ class GateExpert(Expert):
         # half a turn changes nothing about a symmetric bar
         if abs(rotation_vector(bar.rotation)[2]) > np.pi / 2:
             bar = Pose(bar.position, bar.rotation @ about_z(np.pi))
-        if not (right.closed and self.task.holds(contacts, "right", "bar")):
-            self.pick(right, bar, np.array([self.grip_at, 0, 0]))
-            return
         line = np.array([0, post.position[1], CARRY_HEIGHT])
         aside = bar.position - line
         gap = aside[0] - BAR_LENGTH / 2 - post.position[0] - POST_RADIUS
+        staging = Pose(line + np.array([bar.position[0] - gap + STAGING, 0, 0]), np.eye(3))
+        if not (right.closed and self.task.holds(contacts, "right", "bar")):
+            self.pick(right, bar, np.array([self.grip_at, 0, 0]), staging.position)
+            return
         aligned = (
             np.abs(aside[1:]).max() < ALIGNED
             and np.linalg.norm(rotation_vector(bar.rotation)) < ALIGNED_ANGLE
         )
         if gap > GATE and not (aligned and gap < STAGING + 0.01):
-            goal = Pose(line + np.array([bar.position[0] - gap + STAGING, 0, 0]), np.eye(3))
-            goal = self.lift(bar, goal, self.task.props["bar"].rest_height)
+            goal = lift(bar, staging, self.task.props["bar"].rest_height)
             right.move(right.carry(bar, goal), 0.0, self.speed)
             return
         speed = HASTE * self.speed

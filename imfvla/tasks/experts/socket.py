@@ -7,6 +7,7 @@ import numpy as np
 from imfvla.tasks.bimanual import Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.hand import lift
 from imfvla.tasks.kinematics import rotation_vector
 from imfvla.tasks.socket import PEG_LENGTH, SEATED, measure_fit
 
@@ -20,6 +21,7 @@ ALIGNED, ALIGNED_ANGLE = 0.0025, 0.04  # m, rad
 
 class SocketExpert(Expert):
     task_name = "socket"
+    misses = (("left",), ("right",), ("left", "right"))
 
     def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
         self.meeting = np.array([0.0, 0.0, 0.18]) + rng.uniform(-1, 1, 3) * [0.015, 0.02, 0.015]
@@ -36,24 +38,25 @@ class SocketExpert(Expert):
         left, right = self.hands["left"], self.hands["right"]
         socket, peg = (self.task.prop_pose(env.physics, name) for name in ("socket", "peg"))
         meeting = Pose(self.meeting, np.eye(3))
+        waiting = Pose(self.meeting + np.array([PEG_LENGTH / 2 - STANDOFF, 0, 0]), np.eye(3))
 
         has_socket = left.closed and self.task.holds(contacts, "left", "socket")
         if has_socket:
-            goal = self.lift(socket, meeting, self.task.props["socket"].rest_height)
+            goal = lift(socket, meeting, self.task.props["socket"].rest_height)
             left.move(left.carry(socket, goal), 0.0, self.speed)
         else:
-            self.pick(left, socket, self.task.props["socket"].tab_centre + np.array([self.tab_offset, 0, 0]))
+            grasp = self.task.props["socket"].tab_centre + np.array([self.tab_offset, 0, 0])
+            self.pick(left, socket, grasp, meeting.position)
 
         if right.closed and self.task.holds(contacts, "right", "peg"):
-            waiting = np.linalg.norm(socket.position - meeting.position) < 0.02
-            if has_socket and waiting and np.linalg.norm(rotation_vector(socket.rotation)) < 0.12:
+            there = np.linalg.norm(socket.position - meeting.position) < 0.02
+            if has_socket and there and np.linalg.norm(rotation_vector(socket.rotation)) < 0.12:
                 self._insert(socket, peg)
             else:
-                goal = Pose(self.meeting + np.array([PEG_LENGTH / 2 - STANDOFF, 0, 0]), np.eye(3))
-                goal = self.lift(peg, goal, self.task.props["peg"].rest_height)
+                goal = lift(peg, waiting, self.task.props["peg"].rest_height)
                 right.move(right.carry(peg, goal), 0.0, self.speed)
         else:
-            self.pick(right, peg, np.array([self.peg_offset, 0, 0]))
+            self.pick(right, peg, np.array([self.peg_offset, 0, 0]), waiting.position)
 
     def _insert(self, socket: Pose, peg: Pose) -> None:
         """Goes deeper only while aligned; otherwise corrects where it is, in front of the mouth or inside."""

@@ -7,6 +7,7 @@ import numpy as np
 from imfvla.tasks.bimanual import Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.base import Expert
+from imfvla.tasks.experts.hand import OPEN, lift
 from imfvla.tasks.kinematics import about_z, rotation_vector
 
 ABOVE = 0.07  # where the left hand waits above the bar
@@ -55,15 +56,15 @@ class TransferExpert(Expert):
         )
 
         if right_has and not left_has:
-            goal = self.lift(bar, meeting, rest_height)
+            goal = lift(bar, meeting, rest_height)
             right.move(right.carry(bar, goal), 0.0, self.speed)
         elif left_has and raised:
-            free = right.opening > 0.6
+            free = right.opening > OPEN
             gave = self.meeting + np.array([self.give_at, 0, 0])
             rest = Pose(gave + RETREAT, about_z(self.turn["right"] * np.pi / 2))
             right.move(rest if free else right.pose, 1.0, self.speed)
         else:
-            self.pick(right, bar, np.array([self.give_at, 0, 0]))
+            self.pick(right, bar, np.array([self.give_at, 0, 0]), self.meeting)
 
         if left_has and raised:
             left.move(left.carry(bar, meeting), 0.0, self.speed)
@@ -72,7 +73,7 @@ class TransferExpert(Expert):
             turn = np.linalg.norm(rotation_vector(take.rotation @ left.pose.rotation.T))
             away = np.clip(max(aside / 0.02, turn / 0.25) - 0.3, 0, 1)
             goal = Pose(take.position + np.array([0, 0, ABOVE * away]), take.rotation)
-            ready = left.is_at(take, 0.008, 0.08) or (left.opening < 0.6 and left.is_at(take, 0.02, 0.3))
+            ready = left.is_at(take, 0.008, 0.08) or (left.opening < OPEN and left.is_at(take, 0.02, 0.3))
             self._in_place += ready
             left.move(goal, 0.0 if ready and self._in_place > self.wait else 1.0, TAKE_SPEED)
         else:
