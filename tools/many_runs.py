@@ -90,7 +90,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--profile", type=Path, help="file for a cProfile of the process")
     options = parser.parse_args(arguments)
-    found = sorted(path.parent for home in COMMITTED for path in home.glob("*/*/config.yaml"))
+    paths = [path.parent for home in COMMITTED for path in sorted(home.glob("*/*/config.yaml"))]
+    found = list(
+        {path.parts[-2:]: path for path in paths}.values()
+    )  # the last of two of one name, as in a report
     if not found:
         raise UserError("No committed run directories found: start from the repository's root.")
     with tempfile.TemporaryDirectory() as scratch:
