@@ -10,7 +10,8 @@ from imfvla.environment import Environment
 from imfvla.policy import Policy
 from imfvla.process.stopwatch import times_ms
 from imfvla.reporting.bootstrap import bootstrap
-from imfvla.rollouts.actor import ChunkActor, observation_of
+from imfvla.rollouts.actor import ChunkActor
+from imfvla.rollouts.inference import observation_of
 from imfvla.rollouts.threads import threads
 from imfvla.types import tokenize
 

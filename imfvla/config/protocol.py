@@ -13,6 +13,7 @@ from imfvla.options import DIFFERENT, Limit, above, at_least, one_of, require, s
 USUAL_NOISE = 1.0
 FRESH, HELD, ROLLED, ZERO = NOISES = "fresh", "held", "rolled", "zero"
 MOST_CANDIDATES = 64
+MOST_BATCH = 256
 PAUSED, RUNNING = CLOCKS = "paused", "running"
 HOLD, CONTINUE = MEANWHILE = "hold", "continue"
 NO_PREFIX, GUIDED, TRAINED = PREFIXES = "none", "guided", "trained"
@@ -64,6 +65,7 @@ class EvaluationOptions:
       condition: how the world differs from the one that was trained in.
       device: where the policy computes.
       runtime: what computes it: "eager", torch, or "onnx", ONNX Runtime with the run's exported graphs.
+      batch: episodes that a worker plays side by side, computing their chunks as one batch; 1 as in the tables.
       workers: processes with one thread each; 0 works in this process; None takes the physical cores.
       episode_timeout_s: an episode that takes longer is replayed in a fresh worker; None: no limit.
       max_steps: control steps of an episode, None for all.
@@ -86,6 +88,7 @@ class EvaluationOptions:
     condition: ConditionOptions = UNCHANGED
     device: Annotated[str, one_of("cpu", "cuda")] = "cpu"
     runtime: Annotated[str, one_of(*RUNTIMES)] = EAGER
+    batch: Annotated[int, within(1, MOST_BATCH)] = 1
     workers: Annotated[int, within(0, MAX_WORKERS)] | None = None
     episode_timeout_s: (
         Annotated[float, above(0), Limit("at most a week", lambda s: s <= MAX_TIMEOUT_S)] | None
@@ -104,6 +107,13 @@ class EvaluationOptions:
             value = getattr(self, key)
             fits = self.runtime == EAGER or value == only
             wanted = f"{only} with runtime=onnx, whose graphs take one observation on the CPU and no decided actions"
+            require(fits, key, wanted, value)
+        for key, only in (("runtime", EAGER), ("prefix", NO_PREFIX)):
+            value = getattr(self, key)
+            fits = self.batch == 1 or value == only
+            wanted = (
+                f"{only} with batch={self.batch}: graphs and chunks with a prefix are computed one by one"
+            )
             require(fits, key, wanted, value)
         for key, usual in (("delay_ms", MEASURED), ("meanwhile", HOLD)):
             value = getattr(self, key)
@@ -133,6 +143,7 @@ class EvaluationOptions:
             "max_steps": self.max_steps,
             "device": self.device,
             "runtime": self.runtime,
+            "batch": self.batch,
             "noise": self.noise,
             "candidates": self.candidates,
             "clock": self.clock,
@@ -171,11 +182,16 @@ class Protocol:
     condition: str = NONE
     severity: int | None = None
     runtime: str = EAGER  # what computes the policy
+    batch: int = 1  # chunks of so many episodes are computed together
 
     @property
     def tells_jumps(self) -> bool:
         """Whether rows have the distance between consecutive chunks; those of the tables keep their bytes."""
         return (self.noise, self.candidates, self.clock) != (FRESH, 1, PAUSED)
+
+    def place(self, seed: int) -> int:
+        """Of the episode from `seed` in its batch."""
+        return (seed - self.first_seed) % self.batch
 
     @property
     def seeds(self) -> range:
@@ -192,6 +208,7 @@ class Protocol:
             f"_max{self.max_steps}": self.max_steps is not None,
             f"_{self.device}": self.device != "cpu",
             f"_{self.runtime}": self.runtime != EAGER,
+            f"_batch{self.batch}": self.batch != 1,
             f"_delay{_shown(self.delay_ms)}-{self.meanwhile}": self.clock != PAUSED,
             f"-{self.prefix}": self.prefix != NO_PREFIX,
             f"_{self.condition}{self.severity}": self.condition != NONE,
@@ -219,6 +236,7 @@ USUAL = {
     "condition": NONE,
     "severity": None,
     "runtime": EAGER,
+    "batch": 1,
 }
 
 
@@ -247,6 +265,8 @@ def unusual(protocol: Mapping[str, Any]) -> tuple[str, ...]:
         said.append(f"{protocol['condition']} {protocol['severity']}")
     if protocol["runtime"] != EAGER:
         said.append("ONNX Runtime")
+    if protocol["batch"] != 1:
+        said.append(f"batch {protocol['batch']}")
     return tuple(said)
 
 

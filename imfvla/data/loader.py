@@ -2,14 +2,14 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from imfvla.data.augment import Augmentation
+from imfvla.data.augment import Augmentation, Changes
 from imfvla.data.same_content import refuse_other_content
 from imfvla.data.sampler import ResumableSampler
 from imfvla.data.windows import Windows
@@ -19,12 +19,12 @@ DATA = "data"  # key of a state
 RANDOM_STREAM = 1  # differs from the sampler's SeedSequence([seed, epoch]) in length
 
 
-class Loader(Iterator[Batch]):
-    """Endless iterator over the batches of `sampler`, `prefetch` of them prepared ahead by one thread.
+class Loader(Iterator[Any]):
+    """Endless iterator over the batches of `sampler`, `prefetch` of them prepared ahead by `threads` threads.
 
-    Batch i, with its instructions and augmentation, depends on the sampler's seed and i alone. The state
-    counts batches handed out, not those prepared, so a run that resumes sees exactly what it would have
-    seen. `wait_s` adds up the time [s] that the caller waited for data.
+    Batch i, with its instructions and augmentation, depends on the sampler's seed and i alone, and batches come in
+    order however many threads there are. The state counts batches handed out, not those prepared, so a run that resumes
+    sees exactly what it would have seen. `wait_s` adds up the time [s] that the caller waited for data.
     """
 
     def __init__(
@@ -34,21 +34,31 @@ class Loader(Iterator[Batch]):
         *,
         augment: Augmentation | None = None,
         prefetch: int = 2,
+        threads: int = 1,
     ) -> None:
-        if prefetch < 1:
-            raise ValueError(f"prefetch must be at least 1, found {prefetch}.")
+        if prefetch < 1 or threads < 1:
+            raise ValueError(f"prefetch and threads must be at least 1, found {prefetch} and {threads}.")
         self.wait_s = 0.0
         self._windows = windows
         self._sampler = sampler
         self._augment = augment
         self._prefetch = prefetch
-        self._ahead: deque[Future[Batch]] = deque()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="loader")
+        self._finish: Callable[[Batch, Changes | None], Any] | None = None
+        self._ahead: deque[Future[Any]] = deque()
+        self._threads = ThreadPoolExecutor(threads, thread_name_prefix="loader")
 
-    def __next__(self) -> Batch:
+    def finish_with(self, finish: Callable[[Batch, Changes | None], Any]) -> None:
+        """From now on hands out what `finish` makes of batches and the changes of their pictures, which it must apply.
+
+        It is called in the loader's threads.
+        """
+        self._drop()
+        self._finish = finish
+
+    def __next__(self) -> Any:
         first = self._sampler.next_batch
         while len(self._ahead) <= self._prefetch:
-            self._ahead.append(self._thread.submit(self.batch, first + len(self._ahead)))
+            self._ahead.append(self._threads.submit(self._finished, first + len(self._ahead)))
         began = time.perf_counter()
         batch = self._ahead.popleft().result()
         self.wait_s += time.perf_counter() - began
@@ -57,12 +67,20 @@ class Loader(Iterator[Batch]):
 
     def batch(self, number: int) -> Batch:
         """Batch `number`, independent of earlier draws."""
+        batch, changes = self._drawn(number)
+        if changes is None:
+            return batch
+        return replace(batch, obs=replace(batch.obs, images=changes.apply(batch.obs.images)))
+
+    def _drawn(self, number: int) -> tuple[Batch, Changes | None]:
+        """Batch `number` as it was recorded, and the changes of its pictures."""
         seeds = np.random.SeedSequence([self._sampler.seed, RANDOM_STREAM, number])
         rng = np.random.default_rng(seeds)
         batch = self._windows.batch(self._sampler.batch(number), rng)
-        if self._augment is None:
-            return batch
-        return replace(batch, obs=replace(batch.obs, images=self._augment(batch.obs.images, rng)))
+        return batch, None if self._augment is None else self._augment.draw(batch.obs.images, rng)
+
+    def _finished(self, number: int) -> Any:
+        return self.batch(number) if self._finish is None else self._finish(*self._drawn(number))
 
     def describe(self, number: int) -> list[str]:
         """Episode file and step of each row of batch `number`."""
@@ -82,9 +100,9 @@ class Loader(Iterator[Batch]):
         self._drop()
 
     def close(self) -> None:
-        """Stops the background thread."""
+        """Stops the background threads."""
         self._drop()
-        self._thread.shutdown()
+        self._threads.shutdown()
 
     def __enter__(self) -> "Loader":
         return self

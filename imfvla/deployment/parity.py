@@ -15,7 +15,7 @@ from imfvla.policy.noise import chunk_noise
 from imfvla.process.progress import Progress
 from imfvla.process.stopwatch import times_ms
 from imfvla.robot_of import has_environment
-from imfvla.rollouts.actor import observation_of
+from imfvla.rollouts.inference import observation_of
 from imfvla.rollouts.threads import threads
 from imfvla.runtime.onnx_policy import OnnxPolicy
 from imfvla.sources.opening import open_source

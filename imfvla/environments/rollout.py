@@ -1,7 +1,7 @@
 """One episode: an actor in an environment, watched by sinks; demonstrations and policy rollouts alike."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -20,7 +20,24 @@ class ActionError(Exception):
     """Raised by an actor without a usable action; the episode then ends, failed with this label."""
 
 
+Running = Generator[
+    tuple[np.ndarray, int], None, EpisodeResult
+]  # state (S,) and number of each step, then the row
+
+
 def run_episode(
+    env: Environment, actor: Actor, seed: int, sinks: Sequence[Sink], **said: Any
+) -> EpisodeResult:
+    """Runs an `episode` from start to end and returns its row."""
+    running = episode(env, actor, seed, sinks, **said)
+    while True:
+        try:
+            next(running)
+        except StopIteration as end:
+            return end.value
+
+
+def episode(
     env: Environment,
     actor: Actor,
     seed: int,
@@ -30,9 +47,10 @@ def run_episode(
     config: Mapping[str, Any],
     metadata: Mapping[str, Any] | None = None,
     max_steps: int | None = None,
-) -> EpisodeResult:
-    """Runs the episode that starts from `seed` and returns its row.
+) -> Running:
+    """Runs the episode that starts from `seed`, step by step, and returns its row.
 
+    It yields state and number of a step before the actor acts there, so that several episodes can run side by side.
     The episode lasts until the environment ends it, until `max_steps` control steps, or until
     `actor.done(env)` where the actor has a `done` (demonstrators stop some steps after success; policies
     run to the end). It is a success where the last step's outcome says so. An environment that ends an episode before
@@ -90,6 +108,7 @@ def run_episode(
         began = time.perf_counter()
         for index in range(limit):
             state = env.state()
+            yield state, index
             try:
                 decision = actor.act(env, state, index)
                 if not np.isfinite(decision.executed).all():

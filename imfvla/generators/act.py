@@ -35,7 +35,7 @@ class ActionChunking:
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,)."""
         mean, log_variance = (part.to(actions) for part in core.style(context, actions, valid))
-        noise = torch.randn(mean.shape, generator=rng).to(mean)
+        noise = torch.randn(mean.shape, generator=rng, device=rng.device).to(mean)
         chunk = core(context, mean + (0.5 * log_variance).exp() * noise)
         error = masked_mean((chunk - actions).abs(), valid)
         divergence = divergence_from_standard_normal(mean, log_variance)

@@ -43,9 +43,10 @@ class Generator(Protocol):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars without gradient to log.
 
-        `rng` is a generator of the CPU, wherever the actions are: draw first, then move, as in
-        `torch.randn(x.shape, generator=rng).to(x)`. Of several draws (B * N, H, A) those of an observation lie side by
-        side, and the loss is their mean.
+        `rng` is a generator of the actions' device, or of the CPU: draw where it is, then move, as in
+        `torch.randn(x.shape, generator=rng, device=rng.device).to(x)`. Of several draws (B * N, H, A) those of an
+        observation lie side by side, and the loss is their mean. A loss reads no number of a tensor, such as by
+        `.item()`, and makes none of Python's numbers: a GPU would be waited for.
         """
         ...
 
@@ -98,7 +99,7 @@ class UniformTimes:
     """t ~ U[0, 1]."""
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return torch.rand(count, generator=rng)
+        return torch.rand(count, generator=rng, device=rng.device)
 
 
 class BetaTimes:
@@ -108,7 +109,7 @@ class BetaTimes:
         self.alpha, self.span = alpha, span
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return 1 - self.span * (1 - torch.rand(count, generator=rng) ** (1 / self.alpha))
+        return 1 - self.span * (1 - torch.rand(count, generator=rng, device=rng.device) ** (1 / self.alpha))
 
 
 class LogitNormalTimes:
@@ -118,7 +119,7 @@ class LogitNormalTimes:
         self.mean, self.std = mean, std
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return torch.sigmoid(self.mean + self.std * torch.randn(count, generator=rng))
+        return torch.sigmoid(self.mean + self.std * torch.randn(count, generator=rng, device=rng.device))
 
 
 class HighNoiseTimes:
@@ -133,7 +134,7 @@ class HighNoiseTimes:
         self.span, self.power = span, power
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return 1 - self.span * torch.rand(count, generator=rng) ** self.power
+        return 1 - self.span * torch.rand(count, generator=rng, device=rng.device) ** self.power
 
 
 def step_times(nfe: int, last_step: float | None = None) -> Tensor:

@@ -11,6 +11,7 @@ depend on its noise (docs/results.md, "Samples and averages").
 Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 """
 
+from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -37,6 +38,12 @@ def trailing_levels(num_levels: int, nfe: int, last_step: float | None = None) -
     if last_step is None:
         return [round(num_levels * (nfe - i) / nfe) - 1 for i in range(nfe)]
     return [max(round(num_levels * t) - 1, 0) for t in step_times(nfe, last_step).tolist()[:-1]]
+
+
+@lru_cache(maxsize=8)
+def _kept_on(device: torch.device, num_levels: int) -> Tensor:
+    """`squared_cosine` on a device: copied there in every step it would be waited for."""
+    return squared_cosine(num_levels).to(device)
 
 
 class DenoisingDiffusion:
@@ -79,9 +86,9 @@ class DenoisingDiffusion:
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         x = actions.repeat_interleave(self.draws, dim=0)
-        noise = torch.randn(x.shape, generator=rng).to(x)
-        k = torch.randint(self.num_levels, (len(x),), generator=rng)
-        kept = torch.tensor(self.kept, dtype=torch.float64)[k, None, None]
+        noise = torch.randn(x.shape, generator=rng, device=rng.device).to(x)
+        k = torch.randint(self.num_levels, (len(x),), generator=rng, device=rng.device)
+        kept = _kept_on(k.device, self.num_levels)[k, None, None]
         signal, spread = kept.sqrt().to(x), (1 - kept).sqrt().to(x)
         z = signal * x + spread * noise
         target = {"epsilon": noise, "sample": x, "v": signal * noise - spread * x}[self.prediction]

@@ -58,7 +58,7 @@ class ImplicitMaximumLikelihood:
         """
         batch = len(actions)
         shape = (batch * self.candidates, *actions.shape[1:])
-        noise = torch.randn(shape, generator=rng).to(actions)
+        noise = torch.randn(shape, generator=rng, device=rng.device).to(actions)
         with torch.no_grad():
             chunks = self.chunk(core, context.repeat(self.candidates).detach(noise.dtype), noise)
             distance = self.distances(chunks, actions, valid)

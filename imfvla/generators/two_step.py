@@ -53,7 +53,7 @@ class TwoStepRegression:
         """Squared error of both answers for each chunk (B,), each with weight 1."""
         first, logs = self.first.loss(core, context, actions, valid, rng)
         x = actions.repeat_interleave(self.draws, dim=0)
-        noise = torch.randn(x.shape, generator=rng).to(x)
+        noise = torch.randn(x.shape, generator=rng, device=rng.device).to(x)
         z, _ = interpolate(x, noise, x.new_full((len(x),), self.level))
         answer = self.correct(core, context.repeat(self.draws), z)
         error = masked_error(answer - x, valid.repeat_interleave(self.draws, dim=0))

@@ -45,7 +45,7 @@ class PrefixInput(nn.Module):
 
     def draw(self, batch: int, rng: torch.Generator) -> Tensor:
         """How many actions are given in each of a batch of chunks (B,): 0 to `most`, all equally often."""
-        return torch.randint(self.most + 1, (batch,), generator=rng)
+        return torch.randint(self.most + 1, (batch,), generator=rng, device=rng.device)
 
     def forward(self, tokens: Tensor, actions: Tensor, given: Tensor) -> Tensor:
         """Tokens (B, L, D), normalised actions (B, Tp, A) and which are given (B, Tp) -> tokens (B, L, D)."""

@@ -12,6 +12,7 @@ from imfvla.config.protocol import (
     DELAY,
     MAX_EPISODES,
     MEANWHILE,
+    MOST_BATCH,
     MOST_CANDIDATES,
     NOISES,
     PREFIXES,
@@ -86,6 +87,7 @@ class ProtocolRecord(TypedDict):
     condition: NotRequired[Name]
     severity: NotRequired[Annotated[int, within(SEVERITIES[0], SEVERITIES[-1])] | None]
     runtime: NotRequired[Annotated[str, one_of(*RUNTIMES)]]
+    batch: NotRequired[Annotated[int, within(1, MOST_BATCH)]]
 
 
 class Latency(TypedDict):

@@ -18,7 +18,7 @@ from imfvla.reporting.mapping_row import TableRow
 
 OF_CONDITION = {"condition": "name", "severity": "severity"}  # keys of an entry that are keys of `condition`
 KEYS = (
-    *("noise_scale", "noise", "candidates", "clock", "delay_ms", "meanwhile", "prefix", "runtime"),
+    *("noise_scale", "noise", "candidates", "clock", "delay_ms", "meanwhile", "prefix", "runtime", "batch"),
     *OF_CONDITION,
 )
 

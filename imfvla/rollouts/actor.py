@@ -11,7 +11,6 @@ import torch
 
 from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import CONTINUE, FRESH, GUIDED, NO_PREFIX, USUAL_NOISE
-from imfvla.data.resample import resample
 from imfvla.environment import Environment
 from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
 from imfvla.episode import Decision
@@ -20,9 +19,10 @@ from imfvla.policy import Policy
 from imfvla.policy.prefix import Known
 from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.ensemble import TemporalEnsemble
+from imfvla.rollouts.inference import Question, answers, observation_of
 from imfvla.rollouts.noise import ReplanningNoise, distances
 from imfvla.sources.same_robot import refuse_other_robot
-from imfvla.types import Observation, tokenize
+from imfvla.types import tokenize
 
 # A sound policy exceeds the limits slightly and is clipped; one that exceeds them by this many range
 # widths has diverged, and clipping would only hide it.
@@ -89,8 +89,38 @@ class ChunkActor:
         self._images: dict[int, list[np.ndarray]] = {}
         self._states: dict[int, np.ndarray] = {}
         self._coming: tuple[int, np.ndarray] | None = None  # decision and chunk that is not there yet
+        self._looked_at: int | None = (
+            None  # the last step that was looked at, or at which nothing was to be seen
+        )
         decay = self._horizon.ensemble
         self._ensemble = None if decay is None else TemporalEnsemble(decay)
+
+    def look(self, env: Environment, state: np.ndarray, step: int) -> Question | None:
+        """Sees of `step` what the clock says; what the policy is asked there, None where no decision is due.
+
+        `act` does so itself. Who calls it before, for the same step, owes a question its answer: `take`.
+        """
+        self._looked_at, self._seen, self._taken = step, None, None
+        self._receive(step)
+        if self._clock.is_observed(step):
+            self._seen = env.look()
+            self._images[step] = [self._seen[view] for view in self._policy.views]
+            self._states[step] = state
+        if not self._clock.is_decision(step):
+            return None
+        steps = self._horizon.observed_steps(step)
+        self._images = {s: self._images[s] for s in steps}
+        self._states = {s: self._states[s] for s in steps}
+        return self._question(
+            [self._images[s] for s in steps],
+            [self._states[s] for s in steps],
+            self._clock.number(step),
+            self._advance(step),
+        )
+
+    def take(self, samples: np.ndarray, inference_ms: float) -> None:
+        """The answer to the last question: samples (N, Tp, A) and the time that they took."""
+        self._taken = self._chosen(samples, self._advance(self._looked_at)), inference_ms
 
     def act(self, env: Environment, state: np.ndarray, step: int) -> Decision:
         """The action of `step`; looks and replans where the clock says so.
@@ -98,22 +128,12 @@ class ChunkActor:
         Raises:
           ActionError: the part of the chunk that would be executed is not finite, or far outside the limits.
         """
-        images = chunk = inference_ms = jump = None
-        self._receive(step)
-        if self._clock.is_observed(step):
-            images = env.look()
-            self._images[step] = [images[view] for view in self._policy.views]
-            self._states[step] = state
-        if self._clock.is_decision(step):
-            steps = self._horizon.observed_steps(step)
-            self._images = {s: self._images[s] for s in steps}
-            self._states = {s: self._states[s] for s in steps}
-            chunk, inference_ms = self.plan(
-                [self._images[s] for s in steps],
-                [self._states[s] for s in steps],
-                self._clock.number(step),
-                0 if self._last is None else step - self._last[0],
-            )
+        if self._looked_at != step and (question := self.look(env, state, step)) is not None:
+            (samples,), inference_ms = self.ask([question])
+            self.take(samples, inference_ms)
+        chunk = inference_ms = jump = None
+        if self._taken is not None:
+            chunk, inference_ms = self._taken
             self._check(chunk[self._clock.executed(step)])
             jump = self._jump(chunk, step) if self._tells_jumps else None
             self.remember(step, chunk)
@@ -122,7 +142,7 @@ class ChunkActor:
         if self._coming is None or self._clock.meanwhile == CONTINUE:
             self._target = self._planned(step)
         action = self._target
-        return Decision(action, action, images, chunk, inference_ms, jump)
+        return Decision(action, action, self._seen, chunk, inference_ms, jump)
 
     def remember(self, step: int, chunk: np.ndarray) -> None:
         """The chunk (Tp, A) decided at `step` becomes the last one, which the next one follows."""
@@ -181,20 +201,34 @@ class ChunkActor:
         `advance` is the number of steps since the last decision.
         Returns the chunk, float32 (Tp, A), and the time from these arrays to that one [ms].
         """
+        (samples,), took_ms = self.ask([self._question(images, states, replanning, advance)])
+        return self._chosen(samples, advance), took_ms
+
+    def ask(self, questions: Sequence[Question | None]) -> tuple[list[np.ndarray | None], float]:
+        """What this actor's policy answers to questions of its own, or of other actors of the same kind."""
+        return answers(self._policy, questions, self._nfe, self._device, derives=self._prefix == GUIDED)
+
+    def _question(
+        self,
+        images: Sequence[Sequence[np.ndarray]],
+        states: Sequence[np.ndarray],
+        replanning: int,
+        advance: int,
+    ) -> Question:
         began = time.perf_counter()
-        observation = observation_of(images, states, self._words, self._policy.image_size).to(self._device)
-        noise = self._noise.draw(replanning, advance)
-        known = self._known(advance)
-        # The guidance is a derivative, which inference mode does not allow.
-        with torch.no_grad() if self._prefix == GUIDED else torch.inference_mode():
-            told = {} if known is None else {"known": known}
-            chunks = self._policy.predict(observation, noise.to(self._device), self._nfe, **told)
-            answers = chunks.float().cpu().numpy()  # waits for an accelerator
-        chosen = 0
-        if len(answers) > 1 and self._last is not None:
-            chosen = int(np.argmin(np.nan_to_num(self._distances(answers, advance), nan=0.0)))
-        answer = answers[chosen]
-        return answer, 1e3 * (time.perf_counter() - began)
+        observation = observation_of(images, states, self._words, self._policy.image_size)
+        noise, known = self._noise.draw(replanning, advance), self._known(advance)
+        return Question(observation, noise, known, 1e3 * (time.perf_counter() - began))
+
+    def _chosen(self, samples: np.ndarray, advance: int) -> np.ndarray:
+        """Of samples (N, Tp, A) the one nearest to the last chunk; the first where there is none."""
+        if len(samples) == 1 or self._last is None:
+            return samples[0]
+        return samples[int(np.argmin(np.nan_to_num(self._distances(samples, advance), nan=0.0)))]
+
+    def _advance(self, step: int) -> int:
+        """Steps since the last decision, 0 where there was none."""
+        return 0 if self._last is None else step - self._last[0]
 
     def _check(self, actions: np.ndarray) -> None:
         if not np.isfinite(actions).all():
@@ -202,21 +236,3 @@ class ChunkActor:
         margin = FAR * (self._maximum - self._minimum)
         if (actions < self._minimum - margin).any() or (actions > self._maximum + margin).any():
             raise ActionError(FAR_OUT_OF_RANGE)
-
-
-def observation_of(
-    images: Sequence[Sequence[np.ndarray]],
-    states: Sequence[np.ndarray],
-    words: np.ndarray,
-    size: tuple[int, int],
-) -> Observation:
-    """What a policy sees, of batch 1, from the V pictures and the state of each of To steps and word ids int64 (L,).
-
-    Pictures are uint8 (H, W, 3) of any size, and are brought to `size` (H, W).
-    """
-    fitted = np.stack([[resample(picture, size) for picture in step] for step in images])
-    return Observation(
-        images=torch.from_numpy(fitted).permute(0, 1, 4, 2, 3).unsqueeze(0),
-        state=torch.from_numpy(np.stack(states)).unsqueeze(0),
-        instruction=torch.from_numpy(words).unsqueeze(0),
-    )

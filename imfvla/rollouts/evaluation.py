@@ -1,8 +1,10 @@
 """Evaluation: many episodes of one policy on all cores; rows, a summary and three recordings."""
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +78,9 @@ def evaluate(
     for path in sorted(run.path.glob("rollouts/*/summary.json")):
         refuse_other_config(config, run.path, path, _config_digest(path, run.path))
     config_digest = digest_of_config(config)
-    count = min(physical_cores() if options.workers is None else options.workers, options.episodes)
+    batches = math.ceil(options.episodes / options.batch)
+    count = min(physical_cores() if options.workers is None else options.workers, batches)
+    patience_s = None if options.episode_timeout_s is None else options.batch * options.episode_timeout_s
     protocols = [
         Protocol(
             task=config["task"]["name"],
@@ -90,7 +94,7 @@ def evaluate(
     ]
     timed = [_timed(run, config, protocol, options, build) for protocol in protocols]
     summaries = []
-    with worker_pool(count, options.episode_timeout_s) as run_all:
+    with worker_pool(count, patience_s) as run_all:
         for protocol, latency in timed:
             job = Job(build, run.path, protocol)
             name = protocol.name(run.weight_steps()[-1])
@@ -176,11 +180,19 @@ def _roll_out_all(job: Job, protocol: Protocol, rollouts: RolloutLog, run_all: H
     rows = {row["seed"]: row for row in rollouts.rows}
     missing = [seed for seed in protocol.seeds if seed not in rows]
     with Progress(f"{protocol.task}, nfe {protocol.nfe}", protocol.episodes, done=len(rows)) as bar:
-        for row in run_all(roll_out, [(job, seed) for seed in missing]):
-            rows[row["seed"]] = row
-            rollouts.append(row)
-            bar.advance(f"success {sum(r['success'] for r in rows.values())} of {len(rows)}")
+        for played in run_all(roll_out, [(job, seeds) for seeds in _batches(protocol, missing)]):
+            for row in played:
+                rows[row["seed"]] = row
+                rollouts.append(row)
+                bar.advance(f"success {sum(r['success'] for r in rows.values())} of {len(rows)}")
     return [rows[seed] for seed in protocol.seeds]
+
+
+def _batches(protocol: Protocol, seeds: Sequence[int]) -> list[list[int]]:
+    """Ascending seeds by the batch that they are played in; a resumed evaluation leaves places of one empty."""
+    return [
+        list(own) for _, own in groupby(seeds, lambda seed: (seed - protocol.first_seed) // protocol.batch)
+    ]
 
 
 def _record_some(job: Job, rows: Sequence[Row], rollouts: RolloutLog, run_all: Here | Pool) -> dict[str, Any]:

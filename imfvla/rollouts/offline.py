@@ -41,6 +41,7 @@ def refuse_rollout_options(options: EvaluationOptions) -> None:
         ("candidates", 1),
         ("condition", UNCHANGED),
         ("runtime", EAGER),
+        ("batch", 1),
     ):
         found = getattr(options, key)
         require(found == usual, f"evaluation.{key}", "as usual where there is no environment", found)

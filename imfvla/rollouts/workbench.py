@@ -1,4 +1,4 @@
-"""What one worker of an evaluation does: build environment and policy once, then roll out seed after seed."""
+"""What one worker of an evaluation does: build environments and policy once, then roll out seed after seed."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
@@ -12,12 +12,13 @@ from imfvla.config.condition import NONE
 from imfvla.config.protocol import ONNX, Protocol, unusual
 from imfvla.environment import Environment
 from imfvla.environments import environment_of
-from imfvla.environments.rollout import run_episode
+from imfvla.environments.rollout import episode
 from imfvla.reporting.records import Latency, Row
 from imfvla.reporting.rows import row_of, untimed
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.clock import Clock
 from imfvla.rollouts.latency import measure_latency
+from imfvla.rollouts.lockstep import Player, play_in_lockstep
 from imfvla.rollouts.threads import threads
 from imfvla.runtime.graphs import read_graphs
 from imfvla.runtime.onnx_policy import OnnxPolicy
@@ -77,9 +78,9 @@ def measure_alone(job: Job) -> Latency:
         return measure_latency(env, actor, policy.horizon.obs, policy.views, job.protocol.nfe)
 
 
-def roll_out(job: Job, seed: int) -> dict[str, Any]:
-    """The row of the episode from `seed`."""
-    return _play(job, seed, [])
+def roll_out(job: Job, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """The rows of the episodes from `seeds`, played side by side in the places that the protocol gives them."""
+    return _play(job, seeds, [])
 
 
 def record(job: Job, expected: Row, path: Path) -> None:
@@ -95,34 +96,30 @@ def record(job: Job, expected: Row, path: Path) -> None:
         McapSink(path, lossless=False),
         VideoSink(path.with_suffix(".mp4"), views=tuple(env.views), height=VIDEO_HEIGHT),
     ]
-    row = _play(job, expected["seed"], sinks)
+    (row,) = _play(job, [expected["seed"]], sinks)
     before, after = untimed(expected), untimed(row)
     if before != after:
         raise RuntimeError(f"Seed {expected['seed']} played twice differs: {before}, then {after}.")
 
 
-def _play(job: Job, seed: int, sinks: Sequence[Any]) -> dict[str, Any]:
-    env, policy = _place(job)
-    actor = actor_of(job.protocol, policy)
+def _play(job: Job, seeds: Sequence[int], sinks: Sequence[Any]) -> list[dict[str, Any]]:
+    """Rows of episodes side by side. Only one that is alone may have sinks."""
+    protocol = job.protocol
+    _, policy = _place(job)
     config = RunDirectory(job.run).config() if sinks else {}
     metadata = {
         "policy": str(config.get("name", "")),
-        "nfe": job.protocol.nfe,
+        "nfe": protocol.nfe,
         "checkpoint_step": job.step,
-        **({"unusual": said} if (said := ", ".join(unusual(asdict(job.protocol)))) else {}),
+        **({"unusual": said} if (said := ", ".join(unusual(asdict(protocol)))) else {}),
     }
+    said = {"kind": "rollout", "config": config, "metadata": metadata, "max_steps": protocol.max_steps}
+    players = []
+    for env, seed in zip(_worlds(job, len(seeds)), seeds, strict=True):
+        actor = actor_of(protocol, policy)
+        players.append(Player(protocol.place(seed), env, actor, episode(env, actor, seed, sinks, **said)))
     with threads(1):
-        result = run_episode(
-            env,
-            actor,
-            seed,
-            sinks,
-            kind="rollout",
-            config=config,
-            metadata=metadata,
-            max_steps=job.protocol.max_steps,
-        )
-    return row_of(result)
+        return [row_of(result) for result in play_in_lockstep(players, protocol.batch)]
 
 
 def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
@@ -147,8 +144,18 @@ def actor_of(protocol: Protocol, policy: Any) -> ChunkActor:
 def _place(job: Job) -> tuple[Environment, Any]:
     """Environment and policy of a job, each made once."""
     protocol = job.protocol
-    env, policy = _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+    (env, *_), policy = _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
     return env, _exported(policy, job.run, job.step, protocol.nfe) if protocol.runtime == ONNX else policy
+
+
+def _worlds(job: Job, count: int) -> list[Environment]:
+    """So many environments of a job, each made once."""
+    protocol = job.protocol
+    envs, _ = _bench(job.build, job.run, job.step, protocol.condition, protocol.severity)
+    while len(envs) < count:
+        env, _ = job.build(job.run, job.step)  # whose policy is not needed again
+        envs.append(changed(env, protocol.condition, protocol.severity))
+    return envs[:count]
 
 
 @lru_cache(maxsize=1)
@@ -159,7 +166,7 @@ def _exported(policy: Any, run: Path, step: int, nfe: int) -> OnnxPolicy:
 @lru_cache(maxsize=1)
 def _bench(
     build: Build, run: Path, step: int, condition: str = NONE, severity: int | None = None
-) -> tuple[Environment, Any]:
-    """An environment for each condition, since some change its simulation."""
+) -> tuple[list[Environment], Any]:
+    """A first environment, to which `_worlds` adds, for each condition, since some change its simulation."""
     env, policy = build(run, step)
-    return changed(env, condition, severity), policy
+    return [changed(env, condition, severity)], policy

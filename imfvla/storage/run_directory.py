@@ -49,7 +49,9 @@ EXECUTION_KEYS = (
     "training.compile",
     "training.sharding",
     "training.on_non_finite",
+    "training.accumulate",
     "training.prefetch",
+    "training.loader_threads",
     "training.log_every",
     "training.save_every_s",
 )

@@ -91,7 +91,14 @@ def store_path(config: Mapping[str, Any], source: EpisodeSource) -> Path:
 def make_loader(options: ExperimentOptions, windows: Windows) -> Loader:
     """Augmented batches that depend only on the seed and their number."""
     sampler = ResumableSampler(len(windows), options.training.batch_size, options.seed)
-    return Loader(windows, sampler, augment=options.augmentation, prefetch=options.training.prefetch)
+    training = options.training
+    return Loader(
+        windows,
+        sampler,
+        augment=options.augmentation,
+        prefetch=training.prefetch,
+        threads=training.loader_threads,
+    )
 
 
 class _DecodingProgress:

@@ -22,6 +22,7 @@ from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped, deferred_stop
 from imfvla.storage.fingerprint import fingerprint, physical_cores
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.training.accumulation import add_gradients
 from imfvla.training.checkpoint import save_weights
 from imfvla.training.clipping import Clipping
 from imfvla.training.ema import Ema
@@ -31,11 +32,12 @@ from imfvla.training.optimiser import make_optimiser
 from imfvla.training.options import OptimOptions, TrainingOptions
 from imfvla.training.origin import Origin
 from imfvla.training.parallel import Alone
-from imfvla.training.precision import PRECISIONS, autocast, choose_precision
+from imfvla.training.precision import PRECISIONS, allow_tf32, choose_precision
 from imfvla.training.schedule import learning_rate
 from imfvla.training.sharding import FULL, release, shard, whole
 from imfvla.training.spans import Span, Spans
 from imfvla.training.train_state import TrainState, load_state, save_state
+from imfvla.training.transfer import Sent, Transfer
 from imfvla.types import Batch
 
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
@@ -53,7 +55,7 @@ class Trainable(Protocol):
 class Batches(Protocol):
     """Endless batches with a state, such as `imfvla.data.Loader`."""
 
-    def __next__(self) -> Batch: ...
+    def __next__(self) -> Batch | Sent: ...
     def describe(self, number: int) -> list[str]: ...  # episode and step of each row of batch `number`
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
@@ -84,6 +86,8 @@ class Trainer:
         self.device = choose_device(options.device)
         self.policy = policy.to(self.device)
         self.batches, self.run, self.options, self.optim = batches, run, options, optim
+        self.transfer = Transfer(self.processes, self.device)
+        self.transfer.attach(batches)
         self.seed, self.description = seed, dict(description)
         self.processes.begin_alike(self.policy)
         spans = self.policy.spans(options.steps)
@@ -109,6 +113,7 @@ class Trainer:
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         precision = precision or choose_precision(options.precision, self.device)
         self.precision = self.processes.first_of(PRECISIONS, precision)
+        allow_tf32(self.precision)
         self.non_finite = NonFinite(options.on_non_finite)
         if options.compile:
             compile_parts(self.policy)
@@ -178,20 +183,23 @@ class Trainer:
                 )
                 raise Stopped(stop)
 
-    def _update(self, batch: Batch) -> dict[str, float] | None:
+    def _update(self, batch: Batch | Sent) -> dict[str, float] | None:
         """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
-        seed = step_seed(self.seed, self.step)
-        torch.manual_seed(seed)  # for dropout and others that take no generator
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate(group["span"])
         self.ema.settle(self.step)
-        share, rng = self.processes.share(batch).to(self.device), torch.Generator().manual_seed(seed)
+        share = self.transfer.receive(batch)
         for policy in (self.policy, self.ema.policy):
             policy.begin_step(self.step, self.options.steps)
-        with autocast(self.precision, self.device), self.processes.draws(rng, len(share.actions)):
-            loss, logs = self.policy.loss(share, rng)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss, logs = add_gradients(
+            self.policy,
+            share,
+            self.options.accumulate,
+            seed=step_seed(self.seed, self.step),
+            precision=self.precision,
+            processes=self.processes,
+        )
         self.processes.average_gradients(self.policy.parameters())
         limit = self.clipping.limit
         norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit))
@@ -227,12 +235,12 @@ class Trainer:
             floor=self.optim.floor,
         )
 
-    def _skip(self, what: str, value: float, batch: Batch) -> None:
+    def _skip(self, what: str, value: float, batch: Batch | Sent) -> None:
         """Leaves the weights as they are. Raises UserError where training is to stop."""
         release(self.policy)
         cause = name_cause(
             self.policy,
-            batch.to(self.device),
+            self.transfer.whole(batch),
             step_seed(self.seed, self.step),
             self.batches.describe(self.step),
         )

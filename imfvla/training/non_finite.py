@@ -56,7 +56,7 @@ def name_cause(policy: nn.Module, batch: Batch, seed: int, items: Sequence[str])
 
 def _is_finite(policy: nn.Module, batch: Batch, seed: int, row: int, size: int) -> bool:
     torch.manual_seed(seed)
-    rng = torch.Generator().manual_seed(seed)
+    rng = torch.Generator(batch.actions.device).manual_seed(seed)
     policy.zero_grad(set_to_none=True)
     with WholeBatchDraws(rng, 1, row, size):
         loss, _ = policy.loss(rows(batch, slice(row, row + 1)), rng)

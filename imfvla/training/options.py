@@ -21,8 +21,11 @@ class TrainingOptions:
     save_every_s: Annotated[float, at_least(0)]
     # How many weights are kept, evenly spaced, the last ones at the end.
     checkpoints: Annotated[int, within(1, MAX_CHECKPOINTS)]
+    # Parts of a batch, and of a process's share of it, whose gradients are added up one after the other.
+    accumulate: Annotated[int, within(1, MAX_BATCH)]
     prefetch: Annotated[int, within(1, MAX_PREFETCH)]  # batches prepared ahead
-    precision: Annotated[str, one_of("fp32", "bf16", "auto")]
+    loader_threads: Annotated[int, within(1, MAX_THREADS)]  # that prepare them
+    precision: Annotated[str, one_of("fp32", "tf32", "bf16", "auto")]
     compile: bool
     device: Annotated[str, one_of("cpu", "cuda", "auto")]
     # Of OpenMP in a process; None for its share of the cores.

@@ -50,15 +50,29 @@ class Alone:
 
     def share(self, batch: Batch) -> Batch:
         """This process's rows of a batch."""
-        count = len(batch.actions) // self.size
-        return batch if self.size == 1 else rows(batch, slice(self.rank * count, (self.rank + 1) * count))
+        return batch if self.size == 1 else rows(batch, self._mine(len(batch.actions)))
 
-    def draws(self, rng: torch.Generator, count: int) -> AbstractContextManager[Any]:
-        """Context in which the loss of `count` rows uses the whole batch's random numbers for these rows."""
-        return nullcontext() if self.size == 1 else WholeBatchDraws(rng, count, self.rank, self.size)
+    def share_of(self, tensor: Tensor) -> Tensor:
+        """This process's rows of a tensor that has those of a batch."""
+        return tensor[self._mine(len(tensor))]
+
+    def _mine(self, total: int) -> slice:
+        count = total // self.size
+        return slice(self.rank * count, (self.rank + 1) * count)
+
+    def draws(
+        self, rng: torch.Generator, count: int, part: int = 0, parts: int = 1
+    ) -> AbstractContextManager[Any]:
+        """Context in which the loss of `count` rows uses the whole batch's random numbers for these rows.
+
+        They are part `part` of the `parts` equal ones of this process's rows.
+        """
+        place, places = self.rank * parts + part, self.size * parts
+        return nullcontext() if places == 1 else WholeBatchDraws(rng, count, place, places)
 
     def check(self, options: TrainingOptions) -> None:
         """Raises UserError where a batch, or with `sharding` a policy, cannot be divided."""
+        _refuse_parts(options, 1)
         if options.sharding != NONE:
             raise UserError(
                 f"training.sharding={options.sharding} needs several processes, found one: start them with "
@@ -92,10 +106,7 @@ class Shared(Alone):
     """One of the processes that torchrun has started."""
 
     def check(self, options: TrainingOptions) -> None:
-        if options.batch_size % self.size:
-            raise UserError(
-                f"training.batch_size must be a multiple of the {self.size} processes, found {options.batch_size}."
-            )
+        _refuse_parts(options, self.size)
         if options.compile:
             raise UserError(f"training.compile must be false with several processes, found {self.size}.")
 
@@ -160,6 +171,23 @@ def joined_processes(device: str) -> Iterator[Alone]:
     finally:
         dist.destroy_process_group()
         forget_layouts()
+
+
+def _refuse_parts(options: TrainingOptions, processes: int) -> None:
+    """Raises UserError where a batch cannot be divided among processes, and there into parts."""
+    parts = options.accumulate
+    if options.batch_size % (processes * parts):
+        among = [f"the {processes} processes"] * (processes > 1) + [f"training.accumulate={parts}"] * (
+            parts > 1
+        )
+        raise UserError(
+            f"training.batch_size must be a multiple of {' times '.join(among)}, found {options.batch_size}."
+        )
+    if options.compile and parts > 1:
+        raise UserError(
+            f"training.compile must be false with training.accumulate={parts}: random numbers of parts are drawn under "
+            "a mode in which torch compiles nothing."
+        )
 
 
 def rows(batch: Batch, chosen: slice) -> Batch:

@@ -1,5 +1,6 @@
 """Which batch comes when, with which augmentation: functions of the seed and the batch's number alone."""
 
+import threading
 from dataclasses import replace
 from itertools import islice
 
@@ -168,3 +169,37 @@ def test_colors_do_not_depend_on_the_block_size(b, monkeypatch):
 def test_impossible_augmentation_is_refused(options, text):
     with pytest.raises(UserError, match=text):
         replace(Augmentation(), **options)
+
+
+def test_threads_change_no_batch_and_no_order(windows):
+    with loader(windows, prefetch=5) as one, loader(windows, prefetch=5, threads=3) as several:
+        for expected, found in islice(zip(one, several, strict=True), 12):
+            assert_same(found, expected)
+
+
+def test_threads_prepare_batches_at_the_same_time(windows):
+    both = threading.Barrier(2, timeout=60)
+
+    def waits_for_another(batch, changes):
+        both.wait()
+        return batch
+
+    with loader(windows, prefetch=3, threads=2) as batches:
+        batches.finish_with(waits_for_another)
+        assert len([next(batches) for _ in range(4)]) == 4
+
+
+def test_a_loader_hands_out_what_its_batches_are_finished_with(windows):
+    with loader(windows) as plain, loader(windows) as finished:
+        finished.finish_with(lambda batch, changes: (batch, changes))
+        for expected, (batch, changes) in islice(zip(plain, finished, strict=True), 4):
+            assert torch.equal(changes.apply(batch.obs.images), expected.obs.images)
+
+
+@pytest.mark.parametrize("shift_px", [0, 1, 10])
+@pytest.mark.parametrize("colours", [{}, {"brightness": 0, "contrast": 0, "color": 0}, {"contrast": 0.8}])
+def test_operators_of_tensors_change_pictures_as_a_cpu_does(shift_px, colours):
+    augmentation, rng = Augmentation(shift_px=shift_px, **colours), np.random.default_rng(3)
+    images = torch.from_numpy(rng.integers(0, 256, (6, 2, 3, 3, 20, 32), dtype=np.uint8))
+    changes = augmentation.draw(images, rng)
+    assert torch.equal(changes.as_tensors(images), changes.apply(images))

@@ -279,7 +279,7 @@ def test_the_episode_of_a_worker_that_died_is_played_again_and_counted(run):
 def left_over(run: RunDirectory, monkeypatch, rows: int = 2, **options) -> list[int]:
     """The seeds that are played from now on, with so many rows of an interrupted evaluation left."""
     played: list[int] = []
-    original = workbench.run_episode
+    original = workbench.episode
 
     def killed_after_rows(env, actor, seed, *args, **more):
         played.append(seed)
@@ -287,7 +287,7 @@ def left_over(run: RunDirectory, monkeypatch, rows: int = 2, **options) -> list[
             raise KeyboardInterrupt
         return original(env, actor, seed, *args, **more)
 
-    monkeypatch.setattr(workbench, "run_episode", killed_after_rows)
+    monkeypatch.setattr(workbench, "episode", killed_after_rows)
     with pytest.raises(KeyboardInterrupt):
         roll(run, **options)
     return played

@@ -144,9 +144,10 @@ def test_noise_that_later_steps_draw_anew_cannot_be_rolled():
 
 def test_rows_have_jumps_where_something_is_unusual_alone(tmp_path):
     usual = Protocol("fake", "default", 20, "0", 1, 0, 1.0, 0, 1, None, "cpu")
-    plain = roll_out(Job(build_fakes, tmp_path, usual), 3)
+    (plain,) = roll_out(Job(build_fakes, tmp_path, usual), [3])
     assert "chunk_jump" not in plain
     for change in ({"noise": "held"}, {"candidates": 3}, {"clock": "running"}):
-        assert roll_out(Job(build_fakes, tmp_path, replace(usual, **change)), 3)["chunk_jump"] > 0
+        (row,) = roll_out(Job(build_fakes, tmp_path, replace(usual, **change)), [3])
+        assert row["chunk_jump"] > 0
     assert replace(usual, noise="rolled", candidates=1).name(20) == "seeds0-0_nfe1_rolled"
     assert replace(usual, candidates=8).name(20) == "seeds0-0_nfe1_best8"

@@ -13,7 +13,7 @@ from imfvla.training.options import OptimOptions, TrainingOptions
     [
         ({"steps": 0}, r"training\.steps must be between 1 and 1000000000, found 0"),
         ({"checkpoints": 5}, r"training\.checkpoints must be at most 4"),
-        ({"precision": "fp16"}, r"training\.precision must be one of fp32, bf16, auto, found 'fp16'"),
+        ({"precision": "fp16"}, r"training\.precision must be one of fp32, tf32, bf16, auto, found 'fp16'"),
         ({"device": "tpu"}, r"training\.device"),
         ({"threads": 0}, r"training\.threads must be null or between 1 and 1024"),
         ({"sharding": "half"}, r"training\.sharding must be one of none, full, found 'half'"),

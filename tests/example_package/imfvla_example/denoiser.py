@@ -24,8 +24,8 @@ class Denoiser:
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Squared error of each chunk (B,) at uniform times."""
-        t = torch.rand(len(actions), generator=rng)
-        noise = torch.randn(actions.shape, generator=rng)
+        t = torch.rand(len(actions), generator=rng, device=rng.device)
+        noise = torch.randn(actions.shape, generator=rng, device=rng.device)
         found = core(_noised(actions, noise, t), t, torch.zeros_like(t), context)
         error = masked_error(found - actions, valid)
         return error, {"squared_error": error.detach().mean()}
