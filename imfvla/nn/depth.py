@@ -7,6 +7,7 @@ Shapes: B batch, T tokens, D width, S sources, Q queries.
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -95,7 +96,8 @@ def _scores(source: Tensor, queries: Tensor, eps: Tensor) -> tuple[Tensor, Tenso
 
 def _in_full(source: Tensor, queries: Tensor, eps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The source and its `_scores`, all in the precision of the queries whatever autocast says."""
-    with torch.autocast(source.device.type, enabled=False):
+    device = source.device.type
+    with torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext():
         source = source.to(queries.dtype)
         return source, *_scores(source, queries, eps)
 
