@@ -26,7 +26,7 @@ class Generator(Protocol):
 
     `context` is what the core made of B observations. The generator hands it on, and may call
     - `context.repeat(N)`: (B * N, ...), the N draws of an observation side by side, as `repeat_interleave` does,
-    - `context.rows(index)`: some of its rows,
+    - `context.rows(index)`: the rows that a slice or a tensor of numbers names, also several times,
     - `context.detach(dtype)`: without gradient, in the precision of a derivative or of targets.
 
     Generators of this package have `clip` too: normalised actions are taken to lie within [-clip, clip], and `sample`
