@@ -54,16 +54,16 @@ def write_run(run: Path, home: Path, seed: int | None, episodes: int) -> None:
     for kept in ("metrics.jsonl", "status.json"):
         if (run / kept).exists():
             shutil.copy(run / kept, copy / kept)
-    config = yaml.safe_load((run / "config.yaml").read_text())
+    config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
     config["seed"] = config["seed"] if seed is None else seed
-    (copy / "config.yaml").write_text(yaml.safe_dump(config))
+    (copy / "config.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     for summary in sorted(run.glob("rollouts/*/summary.json")):
         write_evaluation(summary, copy / "rollouts", seed, episodes)
 
 
 def write_evaluation(summary: Path, rollouts: Path, seed: int | None, episodes: int) -> None:
-    said = json.loads(summary.read_text())
-    rows = [json.loads(line) for line in (summary.parent / EPISODES).read_text().splitlines()]
+    said = json.loads(summary.read_text(encoding="utf-8"))
+    rows = [json.loads(line) for line in (summary.parent / EPISODES).read_text(encoding="utf-8").splitlines()]
     seeds = range(REPORTING_FIRST_SEED, REPORTING_FIRST_SEED + episodes)
     text = "".join(
         json.dumps(rows[place % len(rows)] | {"seed": one, "start_digest": f"{one:016x}"}) + "\n"
@@ -75,10 +75,10 @@ def write_evaluation(summary: Path, rollouts: Path, seed: int | None, episodes: 
         protocol["weights"] = digest_of(f"{protocol['weights']} of seed {seed}")
     folder = rollouts / name
     folder.mkdir(parents=True)
-    (folder / EPISODES).write_text(text)
+    (folder / EPISODES).write_text(text, encoding="utf-8")
     kept: dict[str, Any] = {key: said[key] for key in KEPT if key in said}
     kept |= {"name": name, "seeds": [seeds[0], seeds[-1]], "protocol": protocol, DIGEST: digest_of(text)}
-    (folder / "summary.json").write_text(json.dumps(kept))
+    (folder / "summary.json").write_text(json.dumps(kept), encoding="utf-8")
 
 
 @as_command
@@ -103,7 +103,10 @@ def main(arguments: list[str] | None = None) -> int:
         evaluations = len(list(runs.glob("*/*/rollouts/*")))
         profiled = ["-m", "cProfile", "-o", str(options.profile)] if options.profile else []
         mapping = Path(scratch) / "tables.yaml"
-        mapping.write_text(re.sub(r"\bepisodes: \d+", f"episodes: {options.episodes}", MAPPING.read_text()))
+        text = re.sub(
+            r"\bepisodes: \d+", f"episodes: {options.episodes}", MAPPING.read_text(encoding="utf-8")
+        )
+        mapping.write_text(text, encoding="utf-8")
         command = [sys.executable, *profiled, "-m", "imfvla.report", f"directories=[{runs}]"]
         command += [f"mapping={mapping}", f"output={scratch}/tables"]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -4,7 +4,7 @@ python tools/peers.py                            # LeRobot from .venvs/lerobot
 python tools/peers.py --python PATH scale=paper      # overrides of our +exp=socket_act
 
 Both have a ResNet-18, of whose features LeRobot makes a token each and ours four a picture. Where LeRobot is missing,
-the reason is printed and nothing is measured.
+the reason is printed and nothing is measured. diffusion_policy is not measured: it has no release to install.
 """
 
 from imfvla.command import as_command, begin
@@ -38,6 +38,7 @@ USUAL = Path(".venvs/lerobot/bin/python")
 RIVAL = Path(__file__).with_name("rivals") / "lerobot_act.py"
 CALLS = ("train", "predict")
 OURS = ("+exp=socket_act", "encoder=resnet18")  # LeRobot's encoder is a ResNet-18 as well
+NOT_RELEASED = "diffusion_policy is not measured: no package index has a release of it."
 FILL = "python3.12 -m venv .venvs/lerobot && .venvs/lerobot/bin/pip install lerobot"
 
 
@@ -141,6 +142,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("overrides", nargs="*", help="of +exp=socket_act, such as scale=paper")
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
+    print(NOT_RELEASED)
     config = compose("train", [*OURS, *options.overrides])
     policy = build_unfitted(config)
     try:

@@ -9,7 +9,9 @@ from imfvla.benchmarks.rounding import RoundedProducts, derivative_errors, round
 
 def test_ten_bits_of_a_fraction_are_kept():
     step = 2.0**-10
-    given = torch.tensor([1.0, 1 + step, 1 + 0.4 * step, 1 + 0.6 * step, 1 + 0.5 * step, 1 + 1.5 * step, -3.0, 0.0])
+    given = torch.tensor(
+        [1.0, 1 + step, 1 + 0.4 * step, 1 + 0.6 * step, 1 + 0.5 * step, 1 + 1.5 * step, -3.0, 0.0]
+    )
     wanted = torch.tensor([1.0, 1 + step, 1.0, 1 + step, 1.0, 1 + 2 * step, -3.0, 0.0])
     assert torch.equal(round_to_tf32(given), wanted)
     drawn = torch.randn(1000)

@@ -102,3 +102,16 @@ def test_a_batch_that_has_no_such_parts_is_refused():
     with pytest.raises(UserError, match=r"compile must be false with training.accumulate=2"):
         Alone().check(replace(OPTIONS, accumulate=2, compile=True))
     Shared(0, 2, 2).check(replace(OPTIONS, accumulate=4))
+
+
+def test_parts_of_shares_draw_what_the_batch_draws():
+    """Two processes of two parts each have the four quarters, in order."""
+    rng = torch.Generator().manual_seed(5)
+    whole = torch.randn(8, 3, generator=rng)
+    found = []
+    for rank in range(2):
+        for part in range(2):
+            rng = torch.Generator().manual_seed(5)
+            with Shared(rank, 2, 2).draws(rng, 2, part, 2):
+                found.append(torch.randn(2, 3, generator=rng))
+    assert torch.equal(torch.cat(found), whole)
