@@ -6,8 +6,8 @@ from imfvla.tasks.bimanual import BimanualTask, StartRange
 from imfvla.tasks.props import BAR_WIDTH, Bar
 
 BAR_LENGTH = 0.22
-# A thin bar is held only where fingers close at most 8 mm above the expert's height, which 16 mm do around a thick one.
-WIDTHS = {"easy": BAR_WIDTH, "default": BAR_WIDTH, "hard": 0.016}
+# A thin bar is held only where fingers close at most 6 mm above the expert's height, a usual one up to 16 mm above.
+WIDTHS = {"easy": BAR_WIDTH, "default": BAR_WIDTH, "hard": 0.014}
 RANGES = {
     "easy": (StartRange((0.14, 0.18), (-0.02, 0.02), (-0.1, 0.1))),
     "default": (StartRange((0.04, 0.24), (-0.125, 0.125), (-0.55, 0.55))),
