@@ -23,10 +23,27 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
+def read(path: Path) -> list[dict]:
+    """The rows with lists of times, as they were written."""
+    rows = read_episodes(path, SEEDS)
+    return [
+        {**row, "timing": {**row["timing"], "inference_ms": list(row["timing"]["inference_ms"])}}
+        for row in rows
+    ]
+
+
 def test_rows_come_in_the_order_of_their_seeds(path):
-    assert list(read_episodes(path, SEEDS)) == ROWS
+    assert read(path) == ROWS
     path.write_text("".join(reversed(TEXT.splitlines(keepends=True))))
-    assert list(read_episodes(path, SEEDS)) == ROWS
+    assert read(path) == ROWS
+
+
+def test_rows_share_their_names_and_hold_times_as_numbers(path):
+    first, second, *_ = read_episodes(path, SEEDS)
+    assert all(one is other for one, other in zip(first, second, strict=True))
+    (again, *_) = read_episodes(path, SEEDS)
+    assert first["start_digest"] is again["start_digest"]
+    assert first["timing"]["inference_ms"].itemsize == 8
 
 
 def changed(number: int, **values) -> str:
