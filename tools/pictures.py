@@ -40,7 +40,11 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS, SHIPPED = ROOT / "experiments" / "results", ROOT / "experiments" / "pretrained"
 FIGURES = {  # picture -> figure of imfvla.report
     name: name for name in ("evaluations", "failures", "learning", "depth_attention")
-} | {"reward_latency": "figure3_reward_latency", "success_by_cost": "success_by_cost_dwell"}
+} | {
+    "reward_latency": "figure3_reward_latency",
+    "success_by_cost": "success_by_cost_dwell",
+    "success_by_delay": "success_by_delay_table4",
+}
 MOMENTS = 6  # of a rollout, start and end among them
 STEPS = [round(share * TIME_LIMIT_STEPS) for share in np.linspace(0, 1, MOMENTS)]
 TIMES = [f"{step / CONTROL_HZ:g} s" for step in STEPS]

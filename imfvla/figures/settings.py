@@ -30,7 +30,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
     ]
     methods = _methods(found)
     with style():
-        figure = new_figure(WIDTH, 0.9 + 4.4 * len(conditions))
+        figure = new_figure(WIDTH, 0.9 + 3.6 * len(conditions))
         axes = figure.subplots(2 * len(conditions), 2, sharex=True, sharey="row", squeeze=False).ravel()
         for axis, (condition, metric, meanwhile) in zip(axes, panels, strict=True):
             world = "" if condition == NONE else f", {condition}"
