@@ -25,7 +25,7 @@ GENERATOR = {
     "StagedMeanFlow": "Mean Flow in two stages",
     "FlowMatching": "flow matching",
     "DenoisingDiffusion": "diffusion (DDPM)",
-    "Regression": "L1 regression",
+    "Regression": "L{power} regression",
     "TwoStepRegression": "two-step regression",
     "ImplicitMaximumLikelihood": "one-step IMLE",
     "ActionChunking": "ACT",
@@ -134,7 +134,7 @@ def describe(config: Mapping[str, Any]) -> Method:
         block_size=residual.get("block_size", 1),
         readout=residual.get("readout", "sum"),
         generator_class=_class(generator),
-        generator="L2 regression" if generator.get("power") == 2 else generator_name(_class(generator)),
+        generator=generator_name(_class(generator), generator.get("power")),
         parametrisation=generator.get("parametrisation"),
         times=_name(times, TIMES) if times else None,
         boundary_share=generator.get("boundary_share"),
@@ -153,10 +153,13 @@ def sublayers_of(core: Mapping[str, Any]) -> tuple[str, ...]:
     return SUBLAYERS.get(_class(core), TWO_SUBLAYERS)
 
 
-def generator_name(cls: str) -> str:
-    """A generator's class in words: those of GENERATOR, else the words that its name is made of."""
+def generator_name(cls: str, power: object = None) -> str:
+    """A generator's class in words: those of GENERATOR, else the words that its name is made of.
+
+    `power` is that of a regression's errors, 1 where nothing is said.
+    """
     if cls in GENERATOR:
-        return GENERATOR[cls]
+        return GENERATOR[cls].format(power=1 if power is None else power)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", cls)
     return " ".join(word if word.isupper() else word.lower() for word in words) or cls
 

@@ -107,8 +107,8 @@ def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
         unit = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
         value = kind.get(unit)
         detail = OUTPUTS.get(str(value), f"{unit} {_class(value) if isinstance(value, dict) else value}")
-        name = generator_name(kind["class"]) or "training loss"
-        titles.append(f"{name}, {detail}" if unit else name)
+        name = generator_name(kind["class"], kind.get("power")) or "training loss"
+        titles.append(f"{name}, {detail}" if unit not in (None, "power") else name)
     return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]
 
 

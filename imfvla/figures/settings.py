@@ -19,7 +19,10 @@ SCALES = {SUCCESS: 100, RETURN: 1}
 
 
 def success_by_delay(results: Sequence[Result]) -> Figure:
-    """Successes and returns for each condition and for what the robot does meanwhile; the paused clock is at 0."""
+    """Successes and returns for each condition and for what the robot does meanwhile; the paused clock is at 0.
+
+    Methods that are measured on the paused clock alone have no line.
+    """
     found = [result for result in results if not result.is_missing]
     conditions = list(dict.fromkeys(_change(result, "condition", NONE) for result in found)) or [NONE]
     panels = [
@@ -28,7 +31,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
         for metric in (SUCCESS, RETURN)
         for meanwhile in (HOLD, CONTINUE)
     ]
-    methods = _methods(found)
+    methods = _methods([result for result in found if result.row.changes])
     with style():
         figure = new_figure(WIDTH, 0.9 + 3.6 * len(conditions))
         axes = figure.subplots(2 * len(conditions), 2, sharex=True, sharey="row", squeeze=False).ravel()
@@ -55,12 +58,12 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
 
 
 def success_by_severity(results: Sequence[Result]) -> Figure:
-    """A panel for each condition; the unchanged world is at 0."""
+    """A panel for each condition; the unchanged world is at 0, for methods that are measured in another one."""
     found = [result for result in results if not result.is_missing]
     conditions = [
         name for name in dict.fromkeys(_change(r, "condition", NONE) for r in found) if name != NONE
     ]
-    methods = _methods(found)
+    methods = _methods([result for result in found if result.row.changes])
     count = max(len(conditions), 1)
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
