@@ -24,7 +24,8 @@ TOY = (
 )  # fmt: skip
 
 
-def test_the_last_line_has_all_figures(capsys, monkeypatch):
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_the_last_line_has_all_figures(precision, capsys, monkeypatch):
     monkeypatch.setattr("imfvla.benchmarks.simulation.MEASURE_S", 0.02)
     monkeypatch.setattr("imfvla.benchmarks.simulation.FRAMES", 1)
     monkeypatch.setattr("imfvla.benchmarks.training.GEMM", 64)
@@ -32,7 +33,7 @@ def test_the_last_line_has_all_figures(capsys, monkeypatch):
         [
             "parts=[simulation,training,latency]", "at_scale=cpu",
             "experiments=[transfer_ph32_exec16]", "nfe=[1,3]", "training_steps=1", "latency_calls=5",
-            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in (*TOY, 'generator=imf_plain'))}]",
+            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in (*TOY, 'generator=imf_plain', f'training.precision={precision}'))}]",
         ]
     )  # fmt: skip
     out = capsys.readouterr().out
@@ -85,7 +86,7 @@ def test_flops_of_the_core_are_those_of_its_matrix_products():
     config = compose("train", ["generator=ddpm", "core=standard", "horizon.pred=8", "horizon.exec=8", *TOY])
     size = measure_size(config, [1, 100])
     width, hidden, tokens, prefix = 16, 32, 2 + 2, 3 * 2 + 3
-    time = 1 * 32 + 2 * 32 * width + width * width
+    time = 2 * 32 * width + width * width
     attention = tokens * width * (3 * width + 2 * (tokens + prefix) + width)
     products = 2 * (4 * 16) * width * 2 + 2 * time + attention + tokens * 3 * width * hidden
     assert size["core_evaluation_gflop"] == pytest.approx(2 * products / 1e9)

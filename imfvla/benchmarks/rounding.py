@@ -89,5 +89,6 @@ def derivative_errors(
 def _derivative(
     policy: Policy, core: nn.Module, context: Any, z: Tensor, r: Tensor, t: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    u, slope = policy.generator.derivative(core, z, r, t, v, context.detach(z.dtype))
+    u, push = policy.generator.linearise(core, z, r, t, context.detach(z.dtype), slice(None))
+    slope = push(v)
     return u, slope, u + (t - r)[:, None, None] * slope

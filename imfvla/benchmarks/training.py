@@ -131,12 +131,20 @@ def _timed_derivative(generator: Any, spent: dict[str, float]) -> Iterator[None]
         yield
         return
 
+    is_within = False
+
     def linearise(*args: Any) -> Any:
         u, push = original(*args)
 
         def timed(v: Any) -> Any:
-            with _timed(spent, "jvp"), _timed(spent, "derivative"):
+            nonlocal is_within
+            if is_within:  # under autocast a derivative asks for another one, in full precision
                 return push(v)
+            is_within = True
+            with _timed(spent, "jvp"), _timed(spent, "derivative"):
+                change = push(v)
+            is_within = False
+            return change
 
         return u, timed
 
