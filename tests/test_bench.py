@@ -29,11 +29,12 @@ def test_the_last_line_has_all_figures(precision, capsys, monkeypatch):
     monkeypatch.setattr("imfvla.benchmarks.simulation.MEASURE_S", 0.02)
     monkeypatch.setattr("imfvla.benchmarks.simulation.FRAMES", 1)
     monkeypatch.setattr("imfvla.benchmarks.training.GEMM", 64)
+    changes = (*TOY, "generator=imf_plain", f"training.precision={precision}")
     main(
         [
             "parts=[simulation,training,latency]", "at_scale=cpu",
             "experiments=[transfer_ph32_exec16]", "nfe=[1,3]", "training_steps=1", "latency_calls=5",
-            "latency_warm_up=1", f"overrides=[{','.join(repr(text) for text in (*TOY, 'generator=imf_plain', f'training.precision={precision}'))}]",
+            "latency_warm_up=1", f"overrides=[{','.join(map(repr, changes))}]",
         ]
     )  # fmt: skip
     out = capsys.readouterr().out
