@@ -108,6 +108,15 @@ def test_every_kind_of_core_has_its_size_and_its_latency(experiment):
     assert latency["infer1"]["core_evaluation_ms"] > 0
 
 
+def test_a_generator_that_has_no_single_step_is_measured_too():
+    config = compose("train", ["generator=two_step", "horizon.pred=8", "horizon.exec=8", *TOY])
+    size = measure_size(config, [2])
+    assert set(size["chunk_gflop"]) == {"infer2"}
+    policy = build_unfitted(config)
+    latency = measure_latency(FakeEnvironment(robot=policy.robot), policy, [2], calls=2, warm_up=1)
+    assert set(latency) == {"infer2"}
+
+
 def test_a_sampler_that_wastes_time_is_reported():
     row = dict.fromkeys(
         ("median_ms", "p95_ms", "encoder_ms", "core_evaluation_ms", "overhead_ms", "of_parts"), 1.0

@@ -38,7 +38,7 @@ def measure_latency(
     noise = torch.randn(1, *policy.noise_shape)
     measured = {}
     with threads(num_threads), torch.inference_mode():
-        inputs = core_inputs(policy.eval(), observation, noise)
+        inputs = core_inputs(policy.eval(), observation, noise, min(nfe))
         for number in nfe:
             actor = ChunkActor(policy, policy.horizon, number, noise_seed=0)
             actor.reset(env, 0)

@@ -21,7 +21,7 @@ def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any
     policy = build_unfitted(config)
     observation, noise = blank_observation(policy), torch.zeros(1, *policy.noise_shape)
     encoder = count_flops(lambda: policy.core.condition(policy.encoder(observation)))
-    inputs = core_inputs(policy.eval(), observation, noise)
+    inputs = core_inputs(policy.eval(), observation, noise, min(nfe))
     core = count_flops(lambda: policy.core(*inputs))
     valid = torch.ones(1, policy.horizon.pred, dtype=torch.bool)
     parameters = [(p.numel(), p.requires_grad) for p in policy.parameters()]
@@ -35,12 +35,12 @@ def measure_size(config: Mapping[str, Any], nfe: Sequence[int]) -> dict[str, Any
     }
 
 
-def core_inputs(policy: Policy, observation: Observation, noise: Tensor) -> tuple[Any, ...]:
-    """What the generator passes to the core in one call, whatever its interface."""
+def core_inputs(policy: Policy, observation: Observation, noise: Tensor, nfe: int) -> tuple[Any, ...]:
+    """What the generator passes to the core in its first call of `nfe`, whatever its interface."""
     seen: list[tuple[Any, ...]] = []
     hook = policy.core.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
     try:
-        policy.predict(observation, noise, 1)
+        policy.predict(observation, noise, nfe)
     finally:
         hook.remove()
     return seen[0]
