@@ -4,13 +4,14 @@ Shapes: B batch, To observed steps, V views, H W pixels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from imfvla.errors import UserError
+from imfvla.types import Batch
 
 FRACTION_BITS = 7  # gains are multiples of 1/128
 MAX_GAIN = 1.98  # keeps (pixel - 128) * gain and its rounding within int16
@@ -107,6 +108,13 @@ class Changes:
         if self.recolors:
             _recolor(augmented, self.gain.numpy(), self.offset.numpy())
         return torch.from_numpy(augmented)
+
+
+def changed(batch: Batch, changes: Changes | None) -> Batch:
+    """A batch with `changes` of its pictures applied, both on one device; the batch itself for None."""
+    if changes is None:
+        return batch
+    return replace(batch, obs=replace(batch.obs, images=changes.apply(batch.obs.images)))
 
 
 def _shift(source: np.ndarray, target: np.ndarray, down: int, right: int) -> None:

@@ -4,12 +4,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from imfvla.data.augment import Augmentation, Changes
+from imfvla.data.augment import Augmentation, Changes, changed
 from imfvla.data.same_content import refuse_other_content
 from imfvla.data.sampler import ResumableSampler
 from imfvla.data.windows import Windows
@@ -67,10 +66,7 @@ class Loader(Iterator[Any]):
 
     def batch(self, number: int) -> Batch:
         """Batch `number`, independent of earlier draws."""
-        batch, changes = self._drawn(number)
-        if changes is None:
-            return batch
-        return replace(batch, obs=replace(batch.obs, images=changes.apply(batch.obs.images)))
+        return changed(*self._drawn(number))
 
     def _drawn(self, number: int) -> tuple[Batch, Changes | None]:
         """Batch `number` as it was recorded, and the changes of its pictures."""

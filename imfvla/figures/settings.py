@@ -31,7 +31,7 @@ def success_by_delay(results: Sequence[Result]) -> Figure:
         for metric in (SUCCESS, RETURN)
         for meanwhile in (HOLD, CONTINUE)
     ]
-    methods = _methods([result for result in found if result.row.changes])
+    methods = _methods(found)
     with style():
         figure = new_figure(WIDTH, 0.9 + 3.6 * len(conditions))
         axes = figure.subplots(2 * len(conditions), 2, sharex=True, sharey="row", squeeze=False).ravel()
@@ -63,7 +63,7 @@ def success_by_severity(results: Sequence[Result]) -> Figure:
     conditions = [
         name for name in dict.fromkeys(_change(r, "condition", NONE) for r in found) if name != NONE
     ]
-    methods = _methods([result for result in found if result.row.changes])
+    methods = _methods(found)
     count = max(len(conditions), 1)
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
@@ -132,7 +132,8 @@ def _legend(figure: Figure) -> None:
 
 
 def _methods(results: Sequence[Result]) -> list[str]:
-    return list(dict.fromkeys(map(_line, results)))
+    """Of the results in another world or on a running clock: others have nothing to be compared with."""
+    return list(dict.fromkeys(_line(result) for result in results if result.row.changes))
 
 
 def _line(result: Result) -> str:

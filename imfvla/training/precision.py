@@ -1,7 +1,7 @@
 """Which arithmetic the loss runs in: fp32, bf16 autocast where it is measured to be faster, or TF32 where it is chosen.
 
 TF32 multiplies numbers of 10 bits (fp32 has 23, bf16 7) in the matrix products and convolutions of a GPU, in those of
-the Jacobian-vector product too, which autocast leaves alone: `tools/derivative_error.py` says how far that is then off.
+the Jacobian-vector product too, which autocast leaves alone: `benchmarks/rounding.py` measures its error.
 """
 
 import time

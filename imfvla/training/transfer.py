@@ -6,13 +6,13 @@ training's thread nor its stream waits for a copy that has been made ahead. Pict
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from imfvla.data.augment import Changes
+from imfvla.data.augment import Changes, changed
 from imfvla.training.parallel import Alone
 from imfvla.types import Batch, Observation
 
@@ -105,11 +105,11 @@ class Transfer:
             _map(self._kept, sent.share)
             if sent.changes is not None:
                 sent.changes.map(self._kept)
-        return _changed(sent.share, sent.changes)
+        return changed(sent.share, sent.changes)
 
     def whole(self, found: Batch | Sent) -> Batch:
         """All rows of a batch on the device, those of other processes too."""
-        return (_changed(*found.whole) if isinstance(found, Sent) else found).to(self._device)
+        return (changed(*found.whole) if isinstance(found, Sent) else found).to(self._device)
 
     def _moved(self, tensor: Tensor) -> Tensor:
         return tensor.to(self._device, non_blocking=True)
@@ -117,12 +117,6 @@ class Transfer:
     def _kept(self, tensor: Tensor) -> Tensor:
         self._streams.keep(tensor)
         return tensor
-
-
-def _changed(batch: Batch, changes: Changes | None) -> Batch:
-    if changes is None:
-        return batch
-    return replace(batch, obs=replace(batch.obs, images=changes.apply(batch.obs.images)))
 
 
 def _map(function: Callable[[Tensor], Tensor], batch: Batch) -> Batch:
