@@ -21,8 +21,9 @@ from imfvla.process.progress import Progress
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import Mapping as RowMapping
-from imfvla.reporting.mapping_tables import COMPARISONS, SETTINGS, TableTitle
+from imfvla.reporting.mapping_tables import COMPARISONS, METHODS, SETTINGS, TableTitle
 from imfvla.reporting.media import Media
+from imfvla.reporting.methods_table import methods_table
 from imfvla.reporting.offline import read_offline
 from imfvla.reporting.offline_tables import offline_table
 from imfvla.reporting.page import Picture, page
@@ -143,6 +144,8 @@ def _is_measured(table: TableTitle, mapping: RowMapping, results: Sequence[Resul
     if table.of == COMPARISONS:
         compared = mapping.of_comparisons(table.name)
         return any({one.row.name, one.baseline.name} <= found.keys() for one in compared)
+    if table.of == METHODS:
+        return any(row.name in found for entry in mapping.of_methods(table.name) for row in entry.rows)
     return any(result.row.table == table.name for result in found.values())
 
 
@@ -156,6 +159,8 @@ def _document(table: TableTitle, mapping: RowMapping, results: Sequence[Result])
         return comparison_table(table.title, compare(mapping.of_comparisons(table.name), results))
     if table.of == SETTINGS:
         return settings_table(table, results)
+    if table.of == METHODS:
+        return methods_table(table, mapping.of_methods(table.name), mapping.of_rows, results)
     rows = [result for result in results if result.row.table == table.name]
     return row_table(table.title, rows, published=published_rows(table.task))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from imfvla.config.assets import folder
 from imfvla.reporting.mapping_comparisons import Comparison, read_comparisons
 from imfvla.reporting.mapping_file import load
+from imfvla.reporting.mapping_methods import MethodEntry, read_methods
 from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.mapping_rows import read_rows
 from imfvla.reporting.mapping_tables import ROWS, SETTINGS, TableTitle, TaskTitle, read_titles
@@ -16,12 +17,13 @@ PATH = folder("experiments") / "tables.yaml"
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """All tables, their rows and the comparisons, each in its order; `tasks` have titles."""
+    """All tables, their rows, comparisons and methods, each in its order; `tasks` have titles."""
 
     tasks: tuple[TaskTitle, ...]
     tables: tuple[TableTitle, ...]
     rows: tuple[TableRow, ...]
     comparisons: tuple[Comparison, ...]
+    methods: tuple[MethodEntry, ...] = ()
 
     @property
     def of_rows(self) -> tuple[TableTitle, ...]:
@@ -44,6 +46,9 @@ class Mapping:
     def of_comparisons(self, name: str) -> tuple[Comparison, ...]:
         return tuple(comparison for comparison in self.comparisons if comparison.table == name)
 
+    def of_methods(self, name: str) -> tuple[MethodEntry, ...]:
+        return tuple(method for method in self.methods if method.table == name)
+
     def find(self, experiment: str, run: str, nfe: int) -> TableRow | None:
         """The first row of an experiment, a `run_key` and an NFE, whatever its checkpoint."""
         wanted = (experiment, run, nfe)
@@ -57,4 +62,5 @@ def read_mapping(path: Path = PATH) -> Mapping:
     content = load(path)
     tasks, tables = read_titles(content, path)
     rows = read_rows(content, tables, path)
-    return Mapping(tasks, tables, rows, read_comparisons(content, tables, rows, path))
+    comparisons = read_comparisons(content, tables, rows, path)
+    return Mapping(tasks, tables, rows, comparisons, read_methods(content, tables, rows, path))

@@ -10,7 +10,7 @@ from imfvla.options import Limit, build, one_of, require, suggestion
 from imfvla.reporting.mapping_file import named, place_of, plain
 from imfvla.reporting.paper import paper_numbers
 
-ROWS, COMPARISONS, SETTINGS = "rows", "comparisons", "settings"
+ROWS, COMPARISONS, SETTINGS, METHODS = "rows", "comparisons", "settings", "methods"
 # of a table's rows
 FIGURES = ("reward_latency", "ablations", "success_by_cost", "success_by_delay", "success_by_severity")
 SECTIONS = ("evaluation", "tasks", "tables")
@@ -28,7 +28,7 @@ class TaskTitle:
 
 @dataclass(frozen=True, slots=True)
 class TableTitle:
-    """A table of rows of one task, of `rows` of others in other settings, or of comparisons.
+    """A table of rows of one task, of `rows` of others in other settings, of comparisons, or of methods by task.
 
     Comparisons of one table are corrected together. `printed` is its number in the paper, None where the paper has no
     such table; `figure` draws its rows.
@@ -36,7 +36,7 @@ class TableTitle:
 
     name: str
     title: str
-    of: Annotated[str, one_of(ROWS, COMPARISONS, SETTINGS)] = ROWS
+    of: Annotated[str, one_of(ROWS, COMPARISONS, SETTINGS, METHODS)] = ROWS
     task: str | None = None
     printed: Annotated[int, PRINTED] | None = None
     figure: Annotated[str, one_of(*FIGURES)] | None = None
@@ -82,7 +82,7 @@ def _check_tables(tables: Sequence[TableTitle], tasks: Sequence[TaskTitle], path
     known = {task.name: task for task in tasks}
     for table in tables:
         where = f"{path}: tables.{table.name}"
-        if table.of != COMPARISONS:
+        if table.of in (ROWS, SETTINGS):
             require(table.task is not None, f"{where}.task", f"one of {', '.join(known)}", table.task)
             named(table.task, known, f"{where}: unknown task")
             wanted = "the names of rows" if table.of == SETTINGS else "absent but with of: settings"

@@ -1,0 +1,91 @@
+"""A table of methods: what each reaches on every task, how long a chunk takes, and how long its training took."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean, median
+
+from imfvla.reporting.cells import BY_NAME
+from imfvla.reporting.curves import learning_curve
+from imfvla.reporting.mapping_methods import MethodEntry
+from imfvla.reporting.mapping_tables import TableTitle
+from imfvla.reporting.results import Result
+from imfvla.reporting.table import MISSING, NOTHING, Table, number, with_interval
+from imfvla.reporting.tables import Document
+
+LATENCY, SHARE = BY_NAME["inference_ms_median"], BY_NAME["success_share"]
+NOTES = (
+    "Success in percent with its 95% interval, and the number of training seeds where it is not one. Chunk: median "
+    "over all replannings of these rows. Training: mean time of these policies on the machines that trained them, "
+    "often two at a time with a core each.",
+)
+
+
+def methods_table(
+    table: TableTitle, methods: Sequence[MethodEntry], of: Sequence[TableTitle], results: Sequence[Result]
+) -> Document:
+    """Methods in lines, and the tables `of` their rows in columns. `results` are of all rows."""
+    named = {result.name: result for result in results}
+    places = [
+        place for place in of if any(row.table == place.name for entry in methods for row in entry.rows)
+    ]
+    rows, data, keys, commands = [], [], [], {}
+    for entry in methods:
+        found = {row.table: named[row.name] for row in entry.rows}
+        measured = [result for result in found.values() if not result.is_missing]
+        ms = median(_chunk_times(measured)) if measured else None
+        minutes = _training_minutes(measured)
+        successes = [_success(found.get(place.name)) for place in places]
+        rows.append((entry.method, *successes, number(ms, 1), number(minutes, 1)))
+        data += [_data(entry, place, found[place.name], minutes) for place in places if place.name in found]
+        keys.append(tuple(result.name for result in found.values()))
+        commands |= {r.row.label: r.answer.command for r in found.values() if r.is_missing}
+    titles = [place.title.split(": ")[-1] for place in places]
+    columns = ("Method", *(title[:1].upper() + title[1:] for title in titles), "Chunk ms", "Training min")
+    shown = Table(table.title, columns, tuple(rows), NOTES, tuple(keys), tuple(commands.items()))
+    return Document(shown, Table(table.title, COLUMNS, tuple(data)))
+
+
+COLUMNS = (
+    "method", "table", "row", "training_seeds", "success_share", "success_share_low", "success_share_high",
+    "latency_ms_median", "training_min", "status",
+)  # fmt: skip
+
+
+def _success(result: Result | None) -> str:
+    if result is None:
+        return NOTHING
+    if result.is_missing:
+        return MISSING
+    seeds = len(result.evaluated)
+    text = with_interval(result.metric(SHARE.name).scaled(100), 1)
+    return text if seeds == 1 else f"{text}, {seeds} seeds"
+
+
+def _data(entry: MethodEntry, place: TableTitle, result: Result, minutes: float | None) -> tuple[str, ...]:
+    share = result.metric(SHARE.name)
+    numbers = (share.value, share.low, share.high)
+    return (
+        entry.method,
+        place.name,
+        result.name,
+        " ".join(str(found.evaluation.training_seed) for found in result.evaluated),
+        *("" if value is None else f"{value:.{SHARE.data_digits}f}" for value in numbers),
+        "" if result.is_missing else f"{result.metric(LATENCY.name).value:.{LATENCY.data_digits}f}",
+        "" if minutes is None else f"{minutes:.2f}",
+        MISSING if result.is_missing else "measured",
+    )
+
+
+def _chunk_times(results: Sequence[Result]) -> list[float]:
+    """A median for each policy [ms]."""
+    return [LATENCY.of(found.episodes) for result in results for found in result.evaluated]
+
+
+def _training_minutes(results: Sequence[Result]) -> float | None:
+    """Mean over the policies that say it; of a run that went on after a stop, all its parts count."""
+    runs: dict[Path, None] = dict.fromkeys(
+        found.evaluation.run for result in results for found in result.evaluated
+    )
+    spent = [learning_curve(run, "train_s")[1] for run in runs]
+    minutes = [seconds[-1] / 60 for seconds in spent if len(seconds)]
+    return fmean(minutes) if minutes else None
