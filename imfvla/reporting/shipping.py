@@ -10,6 +10,8 @@ from typing import Any
 from imfvla.config.protocol import REPORTING_FIRST_SEED
 from imfvla.errors import UserError
 from imfvla.options import part_of
+from imfvla.reporting.model_card import NAME as CARD
+from imfvla.reporting.model_card import model_card
 from imfvla.reporting.runs import evaluations
 from imfvla.storage.documents import read_lines
 from imfvla.storage.files import (
@@ -36,8 +38,8 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
     """Makes `target`, which must not exist yet, whole or not at all, and returns the content of made_by.json.
 
     It gets config and status, the last averaged weights, the metrics of every 10th logged step, the episodes and
-    summaries of the reporting band, and the files that `RECORDED` names. Raises UserError for an unfinished run,
-    weights above 16 MB, no reported evaluation, or a target that exists.
+    summaries of the reporting band, the files that `RECORDED` names, and with weights a model card. Raises UserError
+    for an unfinished run, weights above 16 MB, no reported evaluation, or a target that exists.
     """
     refuse_existing(target, EXISTING)
     state = run.status().get("state")
@@ -67,6 +69,8 @@ def ship(run: RunDirectory, target: Path, with_weights: bool = True) -> dict[str
                 copy_file(source, part / source.relative_to(run.path), home=run.path)
             write_text(part / "metrics.jsonl", "".join(rows[THINNING - 1 :: THINNING]))
             write_json(part / "made_by.json", made_by)
+            if with_weights:
+                write_text(part / CARD, model_card(run, target, str(made_by["command"])))
             with clear_write_errors(target):
                 put_folder(part, target)
         finally:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 
 from imfvla.config.protocol import MAX_SEED
 from imfvla.errors import UserError
-from imfvla.options import Limit, Number, Plain, at_most, convert, one_of, within
+from imfvla.options import Limit, Number, Plain, at_least, at_most, convert, one_of, within
 from imfvla.storage.documents import read_json
 
 LARGEST = 1e12  # of a reward or a time: their sums and squares are finite
@@ -101,6 +101,8 @@ class WeightsDescription(TypedDict):
     step: Step
     train_s: Duration
     fingerprint: Fingerprint
+    num_parameters: NotRequired[Annotated[int, at_least(1)]]
+    precision: NotRequired[Label]
 
 
 class MetricsRow(TypedDict):

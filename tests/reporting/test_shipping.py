@@ -6,8 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from imfvla.config.assets import folder
 from imfvla.errors import UserError
 from imfvla.reporting.metrics import summarise
+from imfvla.reporting.model_card import model_card
 from imfvla.reporting.shipping import command_of, ship
 from imfvla.storage.files import write_json
 from imfvla.storage.run_directory import DONE, RUNNING, RunDirectory
@@ -24,16 +26,34 @@ EPISODE = {
     "timing": {"wall_s": 2.0, "inference_ms": [4.0]},
 }
 
+POLICIES = folder("experiments") / "pretrained"
+CONFIG = {
+    "name": "socket_ph32_exec16", "seed": 3, "training": {"steps": 20, "batch_size": 32},
+    "horizon": {"obs": 1, "pred": 32, "exec": 16},
+    "task": {"name": "socket", "variant": "hard", "expert": {"modes": 2}},
+    "demos": {"source": "scripted", "episodes": 50, "first_seed": 7},
+    "generator": {"_target_": "imfvla.generators.flow.FlowMatching"}, "core": {"_target_": "imfvla.nn.act.ActCore"},
+}  # fmt: skip
+MADE = {
+    "code": {"version": "0.1.0", "commit": "0123456789abcdef"}, "machine": {"cpu": "a fast | CPU"}, "threads": 2,
+}  # fmt: skip
+
 
 def make_run(path: Path, first_seed: int = 100_000, state: str = DONE, size: int = 10) -> RunDirectory:
     run = RunDirectory(path)
     write_json(run.path / "status.json", {"state": state})
-    (run.path / "config.yaml").write_text(yaml.safe_dump({"name": "socket_ph32_exec16", "seed": 3}))
+    (run.path / "config.yaml").write_text(yaml.safe_dump(CONFIG))
     for step in (10, 20):
         weights = run.weights_directory(step) / "policy.safetensors"
         write_json(
             weights.with_suffix(".json"),
-            {"step": step, "train_s": 60.0, "fingerprint": {"code": {"commit": "abc"}, "machine": {}}},
+            {
+                "step": step,
+                "train_s": 60.0,
+                "precision": "fp32",
+                "num_parameters": 3_017_628,
+                "fingerprint": MADE,
+            },
         )
         weights.write_bytes(bytes(size))
     run.last_state.parent.mkdir()
@@ -68,6 +88,7 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
         "status.json",
         "metrics.jsonl",
         "made_by.json",
+        "README.md",
         "checkpoints/step-20/policy.safetensors",
         "checkpoints/step-20/policy.json",
         "rollouts/reported/episodes.jsonl",
@@ -75,7 +96,7 @@ def test_what_evaluation_needs_is_taken_and_the_rest_left(tmp_path):
     }
     assert (tmp_path / "shipped" / "metrics.jsonl").read_text().count("\n") == 3
     assert made_by["command"] == "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20"
-    assert (made_by["code"], made_by["seed"]) == ({"commit": "abc"}, 3)
+    assert (made_by["code"], made_by["seed"]) == (MADE["code"], 3)
     assert made_by["results"]["reported"]["success_episodes"] == 1
 
 
@@ -128,3 +149,32 @@ def test_a_shipped_policy_is_not_overwritten(tmp_path):
     (tmp_path / "shipped").mkdir()
     with pytest.raises(UserError, match="exists already"):
         ship(make_run(tmp_path / "run"), tmp_path / "shipped")
+
+
+def test_the_card_of_a_policy_says_what_it_is_and_reaches(tmp_path):
+    run = make_run(tmp_path / "runs" / "socket_ph32_exec16" / "training.steps=20")
+    ship(run, tmp_path / "mine" / "shipped")
+    card = (tmp_path / "mine" / "shipped" / "README.md").read_text()
+    assert card.startswith("# mine/shipped\n")
+    for line in (
+        "| policy | FlowMatching on ActCore, 3.02 M parameters |",
+        "| task | socket (hard) |",
+        "| demonstrations | scripted, episodes 50, first_seed 7, expert.modes 2 |",
+        "| training | 20 steps of 32 observations, seed 3 |",
+        "| its time | 1 min, 2 thread(s), fp32, a fast \\| CPU |",
+        "| code | imfvla 0.1.0, commit 0123456 |",
+        "| 1 | step 20 | 1/1 ",
+        f"run={tmp_path}/mine/shipped nfe=1 ",
+        "python -m imfvla.train +exp=socket_ph32_exec16 training.steps=20    # trained it, at the commit above",
+    ):
+        assert line in card
+    assert "failed" not in card  # none did
+
+
+@pytest.mark.parametrize("made", sorted(POLICIES.rglob("made_by.json")), ids=lambda path: path.parent.name)
+def test_the_cards_of_the_shipped_policies_are_those_that_their_files_give(made):
+    place = made.parent
+    command = json.loads(made.read_text())["command"]
+    assert (place / "README.md").read_text() == model_card(
+        RunDirectory(place), place.relative_to(POLICIES.parents[1]), command
+    ), "run python tools/model_cards.py"
