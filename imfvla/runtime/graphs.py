@@ -28,10 +28,14 @@ class Card(TypedDict):
     digests: Annotated[Mapping[str, Name], at_most(MOST_GRAPHS)]  # of the graphs' files
 
 
+def missing_packages() -> list[str]:
+    """Those that are not installed of the packages that write and compute graphs."""
+    return [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+
+
 def require_packages() -> None:
-    """Raises UserError where the packages that write and compute graphs are missing."""
-    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
+    """Raises UserError where such packages are missing."""
+    if missing := missing_packages():
         raise UserError(f"runtime=onnx needs {', '.join(missing)}: {install_command('onnx')}.")
 
 

@@ -28,7 +28,7 @@ def peers():
 def test_the_rival_gets_our_sizes(peers):
     config = compose("train", ["+exp=socket_act", *SMALL])
     sizes = peers["sizes_of"](config, build_unfitted(config), 3, 1)
-    assert sizes["views"], sizes["image_size"] == (3, [32, 32])
+    assert (sizes["views"], sizes["image_size"]) == (3, [32, 32])
     assert (sizes["state"], sizes["action"], sizes["steps"]) == (16, 16, config["horizon"]["pred"])
     assert sizes["hidden"] == config["core"]["mlp_ratio"] * config["core"]["width"]
 
@@ -52,7 +52,7 @@ def test_both_are_measured_in_turn(peers, capsys, tmp_path):
     python = tmp_path / "python"
     python.write_text(f'#!/bin/sh\nexec {sys.executable} {answering} "$@"\n')
     python.chmod(0o755)
-    assert peers["main"](["--python", str(python), "--batch", "1", "--rounds", "2", *SMALL]) == 0
+    assert peers["main"](["--python", str(python), "--eager", "--batch", "1", "--rounds", "2", *SMALL]) == 0
     printed = capsys.readouterr().out
     assert "ACT here and in LeRobot 0" in printed
     assert "4000.0" in printed
