@@ -125,7 +125,7 @@ METRICS = (
            estimate=estimated(estimates.mean, rewards), printed="avg_reward"),
     Metric("median_return", "median", plain(np.median, rewards), "Median", 1,
            estimate=estimated(estimates.median, rewards), printed="median", printed_digits=1),
-    Metric("iqm_return", "iqm", plain(estimates.trimmed, rewards),
+    Metric("iqm_return", "iqm", plain(estimates.trimmed_mean, rewards),
            estimate=estimated(estimates.interquartile_mean, rewards)),
     Metric("mean_max_reward", "avg_max", plain(np.mean, highest_rewards), "Avg. max", 2,
            estimate=estimated(estimates.mean, highest_rewards), printed="avg_max"),
