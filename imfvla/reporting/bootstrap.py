@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import special
+import scipy
 
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.resampling import (
@@ -127,13 +127,13 @@ def _bias_corrected(distribution: np.ndarray, value: float, left_out: np.ndarray
     """
     near = 1e-9 * np.std(distribution[np.isfinite(distribution)])  # equal numbers differ in rounding
     lower = np.count_nonzero(distribution < value - near) + np.count_nonzero(distribution <= value + near)
-    bias = special.ndtri(lower / (2 * distribution.size))
+    bias = scipy.special.ndtri(lower / (2 * distribution.size))
     number = float(left_out.size)
     influence = (number - 1) * (np.mean(left_out, keepdims=True) - left_out)
     cubes, squares = np.sum(influence**3) / number**3, np.sum(influence**2) / number**2
     acceleration = 1 / 6 * cubes / squares ** (3 / 2)
-    moved = bias + np.array([1, -1]) * special.ndtri((1 - (TAILS[1] - TAILS[0])) / 2)
-    shares = special.ndtr(bias + moved / (1 - acceleration * moved))
+    moved = bias + np.array([1, -1]) * scipy.special.ndtri((1 - (TAILS[1] - TAILS[0])) / 2)
+    shares = scipy.special.ndtr(bias + moved / (1 - acceleration * moved))
     return _quantiles(distribution, shares) if np.isfinite(shares).all() else shares
 
 
@@ -167,7 +167,7 @@ def _hierarchical(
     variance = np.var(distribution)
     freedom = variance**2 / sum(part**2 / free for part, free in parts)
     freedom = float(freedom) if np.isfinite(freedom) else np.inf
-    stretch = special.stdtrit(freedom, TAILS[1]) / special.ndtri(TAILS[1])
+    stretch = scipy.special.stdtrit(freedom, TAILS[1]) / scipy.special.ndtri(TAILS[1])
     low, high = (float(value + stretch * (end - value)) for end in _percentiles(distribution))
     return Bootstrapped(value, low, high, float(np.sqrt(variance)), freedom)
 

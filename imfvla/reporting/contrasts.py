@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
-from scipy import special
+import scipy
 
 from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
 from imfvla.reporting.estimates import log_pooled_mean, share_difference
@@ -114,7 +114,9 @@ def _p_value(ours: np.ndarray, theirs: np.ndarray, found: Bootstrapped) -> tuple
     p = sign_flip(ours.mean(axis=0) - theirs.mean(axis=0))
     if max(len(ours), len(theirs)) == 1:
         return p, SIGN_FLIP
-    of_seeds = 2 * float(special.stdtr(found.freedom, -abs(found.value) / found.error)) if found.error else p
+    of_seeds = (
+        2 * float(scipy.special.stdtr(found.freedom, -abs(found.value) / found.error)) if found.error else p
+    )
     return max(p, of_seeds), SEEDS
 
 

@@ -6,7 +6,7 @@ Columns are (n,), or (S, n) where S training seeds met the same n starts; `boots
 import math
 
 import numpy as np
-from scipy import special
+import scipy
 
 from imfvla.reporting.bootstrap import TAILS, bootstrap
 from imfvla.reporting.measured import Measured
@@ -47,10 +47,10 @@ def share(happened: np.ndarray) -> Measured:
     if len(happened) == 1:
         return Measured(value, *wilson_interval(int(happened.sum()), happened.size))
     found = bootstrap(MEAN, happened)
-    trials, score = happened.shape[1], float(special.ndtri(TAILS[1]))
+    trials, score = happened.shape[1], float(scipy.special.ndtri(TAILS[1]))
     if found.error:
         trials = min(value * (1 - value) / found.error**2, happened.size)
-        score = float(special.stdtrit(found.freedom, TAILS[1]))
+        score = float(scipy.special.stdtrit(found.freedom, TAILS[1]))
     return Measured(value, *wilson_interval(value * trials, trials, score))
 
 

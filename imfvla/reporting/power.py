@@ -3,7 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
-from scipy import optimize, special
+import scipy
 
 ALPHA = 0.05
 POWER = 0.8
@@ -29,7 +29,7 @@ def detectable_share_difference(pairs: int, disagreement: float = 0.5) -> float 
 
     if excess(1.0) < 0:
         return None
-    return float(optimize.brentq(excess, 0.0, 1.0, xtol=1e-6))
+    return float(scipy.optimize.brentq(excess, 0.0, 1.0, xtol=1e-6))
 
 
 def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
@@ -37,8 +37,16 @@ def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
     number, most = np.arange(pairs + 1), _most_successes(pairs)
     better = 0.5 + 0.5 * difference / disagreement if disagreement else 0.5
     significant = _at_most(most, number, 1 - better) + _at_most(most, number, better)
-    ways = special.gammaln(pairs + 1) - special.gammaln(number + 1) - special.gammaln(pairs - number + 1)
-    chance = ways + special.xlogy(number, disagreement) + special.xlog1py(pairs - number, -disagreement)
+    ways = (
+        scipy.special.gammaln(pairs + 1)
+        - scipy.special.gammaln(number + 1)
+        - scipy.special.gammaln(pairs - number + 1)
+    )
+    chance = (
+        ways
+        + scipy.special.xlogy(number, disagreement)
+        + scipy.special.xlog1py(pairs - number, -disagreement)
+    )
     return float(np.exp(chance) @ significant)
 
 
@@ -46,14 +54,14 @@ def mcnemar_power(pairs: int, disagreement: float, difference: float) -> float:
 def _most_successes(pairs: int) -> np.ndarray:
     """Of the worse side up to which a result is significant, -1 for none, where 0 to `pairs` disagree."""
     number = np.arange(pairs + 1)
-    most = np.floor(np.nan_to_num(special.bdtrik(ALPHA / 2, number, 0.5), nan=-1.0))
+    most = np.floor(np.nan_to_num(scipy.special.bdtrik(ALPHA / 2, number, 0.5), nan=-1.0))
     most += _at_most(most + 1, number, 0.5) <= ALPHA / 2  # it is right but for rounding
     return most - (_at_most(most, number, 0.5) > ALPHA / 2)
 
 
 def _at_most(successes: np.ndarray, trials: np.ndarray, share: float) -> np.ndarray:
     """Binomial probability of at most so many successes."""
-    found = special.bdtr(np.clip(successes, 0, trials), trials, share)
+    found = scipy.special.bdtr(np.clip(successes, 0, trials), trials, share)
     return np.where(successes < 0, 0.0, found)
 
 
@@ -64,4 +72,6 @@ def detectable_difference(error: float, freedom: float = np.inf) -> float:
       error: of the difference; s / sqrt(n) for n pairs whose differences have the standard deviation s.
       freedom: degrees of freedom of t.
     """
-    return float((special.stdtrit(freedom, 1 - ALPHA / 2) + special.stdtrit(freedom, POWER)) * error)
+    return float(
+        (scipy.special.stdtrit(freedom, 1 - ALPHA / 2) + scipy.special.stdtrit(freedom, POWER)) * error
+    )

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy import special
+import scipy
 
 MOST_EXACT = 16  # pairs that differ; with more, sign flips are drawn
 FLIPS = 100_000
@@ -20,7 +20,7 @@ def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
     only_ours, only_theirs = int((ours & ~theirs).sum()), int((theirs & ~ours).sum())
     if only_ours + only_theirs == 0:
         return 1.0
-    return min(1.0, 2 * float(special.bdtr(min(only_ours, only_theirs), only_ours + only_theirs, 0.5)))
+    return min(1.0, 2 * float(scipy.special.bdtr(min(only_ours, only_theirs), only_ours + only_theirs, 0.5)))
 
 
 def sign_flip(differences: np.ndarray) -> float:
