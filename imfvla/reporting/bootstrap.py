@@ -125,8 +125,7 @@ def _bias_corrected(distribution: np.ndarray, value: float, left_out: np.ndarray
 
     B. Efron and R. Tibshirani, An Introduction to the Bootstrap, 1993, eq. 14.9 to 14.15.
     """
-    near = 1e-9 * np.std(distribution[np.isfinite(distribution)])  # equal numbers differ in rounding
-    lower = np.count_nonzero(distribution < value - near) + np.count_nonzero(distribution <= value + near)
+    lower = np.count_nonzero(distribution < value) + np.count_nonzero(distribution <= value)
     bias = scipy.special.ndtri(lower / (2 * distribution.size))
     number = float(left_out.size)
     influence = (number - 1) * (np.mean(left_out, keepdims=True) - left_out)
