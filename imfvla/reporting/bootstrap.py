@@ -51,7 +51,7 @@ class Bootstrapped:
         return Measured(*known)
 
 
-def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstrapped:
+def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns, over_seeds: bool = True) -> Bootstrapped:
     """A statistic with an interval from 10,000 resamples of a fixed generator.
 
     With one training seed a policy: BCa over starts (B. Efron, JASA 82, 1987), and percentiles where the acceleration
@@ -61,6 +61,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
     Args:
       statistic: of `resampling`, of the columns of all policies.
       policies: one column or several, each (n,) or (S, n); of all policies from the same n starts.
+      over_seeds: whether training seeds are a sample too; else the interval is over starts, with all seeds in each.
     """
     policies = tuple(
         tuple(np.atleast_2d(np.asarray(column, float)) for column in columns)
@@ -72,7 +73,7 @@ def bootstrap(statistic: Statistic, *policies: np.ndarray | Columns) -> Bootstra
         raise ValueError(
             f"The columns must have the same starts, found {[column.shape for column in columns]}."
         )
-    return _found(statistic, tuple(tuple(map(_kept, columns)) for columns in policies), RESAMPLES)
+    return _found(statistic, tuple(tuple(map(_kept, columns)) for columns in policies), RESAMPLES, over_seeds)
 
 
 Kept = tuple[tuple[int, ...], bytes]  # shape and content of a column
@@ -83,7 +84,9 @@ def _kept(column: np.ndarray) -> Kept:
 
 
 @lru_cache(maxsize=1024)  # a row's numbers are asked for by tables, figures and the row's other numbers
-def _found(statistic: Statistic, kept: tuple[tuple[Kept, ...], ...], resamples: int) -> Bootstrapped:
+def _found(
+    statistic: Statistic, kept: tuple[tuple[Kept, ...], ...], resamples: int, over_seeds: bool
+) -> Bootstrapped:
     policies = [tuple(np.frombuffer(held).reshape(shape) for shape, held in columns) for columns in kept]
     columns = [column for columns in policies for column in columns]
     starts, seeds = columns[0].shape[1], tuple(len(columns[0]) for columns in policies)
@@ -93,7 +96,7 @@ def _found(statistic: Statistic, kept: tuple[tuple[Kept, ...], ...], resamples: 
             return Bootstrapped(value)
         if all(np.ptp(column) == 0 for column in columns):
             return Bootstrapped(value, value, value, 0.0)
-        if max(seeds) > 1:
+        if over_seeds and max(seeds) > 1:
             return _hierarchical(
                 statistic, policies, value, of_starts_and_seeds(starts, seeds, resamples, RESAMPLES_OF_PARTS)
             )

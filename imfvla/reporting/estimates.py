@@ -12,6 +12,8 @@ from imfvla.reporting.bootstrap import TAILS, bootstrap
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.resampling import OfMeans, OfOrdered, Statistic, middle, trimmed
 
+FEWEST_TRAININGS = 3  # that an interval of times is over
+
 
 def mean(values: np.ndarray) -> Measured:
     return _located(MEAN, values)
@@ -29,11 +31,14 @@ def interquartile_mean(values: np.ndarray) -> Measured:
 def pooled_mean(totals: np.ndarray, counts: np.ndarray) -> Measured:
     """Mean of positive numbers of which episodes have several each, such as the times of their replannings.
 
-    The interval is over episodes and found on logarithms. Measured(None) without any number.
+    The interval is over episodes and found on logarithms. It is over training seeds too from three on: two say so
+    little about a third that the interval of a time, which hardly depends on the weights, would reach from a tenth of
+    it to ten times. Measured(None) without any number.
     """
     if not np.sum(counts):
         return Measured(None)
-    return bootstrap(POOLED_MEAN, (totals, counts)).exponential
+    is_sample = len(np.atleast_2d(totals)) >= FEWEST_TRAININGS
+    return bootstrap(POOLED_MEAN, (totals, counts), over_seeds=is_sample).exponential
 
 
 def share(happened: np.ndarray) -> Measured:

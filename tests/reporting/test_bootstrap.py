@@ -164,11 +164,13 @@ def test_counts_give_the_interval_of_scipy_which_lays_out_every_resample(statist
     assert [found.low, found.high] == pytest.approx(list(reference.confidence_interval), rel=1e-3)
 
 
-@pytest.mark.parametrize("statistic", DIRECTLY)
+@pytest.mark.parametrize("statistic", [MEAN, INTERQUARTILE_MEAN])
 @pytest.mark.parametrize("number", [16, 101, 300])
 def test_intervals_of_whole_numbers_are_those_of_scipy(statistic, number):
     values = np.random.default_rng(number).integers(0, 40, number)
-    reference = stats.bootstrap((values,), DIRECTLY[statistic], n_resamples=10_000, rng=np.random.default_rng(0))
+    reference = stats.bootstrap(
+        (values,), DIRECTLY[statistic], n_resamples=10_000, rng=np.random.default_rng(0)
+    )
     found = bootstrap(statistic, values)
     assert [found.low, found.high] == pytest.approx(list(reference.confidence_interval), rel=1e-12)
 
