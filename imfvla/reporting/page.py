@@ -52,13 +52,13 @@ def page(
     links = [(table.title, _id(table.title)) for table in tables]
     links += [("Figures", "figures"), ("Differences", "differ"), ("Rows", "rows")]
     navigation = "".join(f'<a href="#{target}">{html_text(name)}</a>' for name, target in links)
-    return (
+    head = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{TITLE}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>\n"
-        + "\n".join(sections)
-        + f"\n<script>\n{SCRIPT.read_text(encoding='utf-8')}</script></body></html>\n"
+        f"<style>\n{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>"
     )
+    tail = f"<script>\n{SCRIPT.read_text(encoding='utf-8')}</script></body></html>\n"
+    return "\n".join((head, *sections, tail))  # once: it may have 100 MB
 
 
 def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
