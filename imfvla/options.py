@@ -51,21 +51,22 @@ class Limit:
     wanted: str
     holds: Callable[[Any], bool]
     is_of_length: bool = False  # then it is checked before the entries, of which there may be millions
+    is_range: bool = False  # then it holds for what lies between two numbers for which it holds
 
 
 def at_least(lowest: float) -> Limit:
     """Numbers from `lowest` on."""
-    return Limit(f"at least {lowest}", lambda value: value >= lowest)
+    return Limit(f"at least {lowest}", lambda value: value >= lowest, is_range=True)
 
 
 def above(bound: float) -> Limit:
     """Numbers greater than `bound`."""
-    return Limit(f"above {bound}", lambda value: value > bound)
+    return Limit(f"above {bound}", lambda value: value > bound, is_range=True)
 
 
 def within(lowest: float, highest: float) -> Limit:
     """Numbers from `lowest` to `highest`, both included."""
-    return Limit(f"between {lowest} and {highest}", lambda value: lowest <= value <= highest)
+    return Limit(f"between {lowest} and {highest}", lambda value: lowest <= value <= highest, is_range=True)
 
 
 def one_of(*choices: Any) -> Limit:
@@ -126,7 +127,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         raise UserError(
             f"Missing key {', '.join(missing)}: give it a value in the config or on the command line."
         )
-    hints = _hints(cls)
+    hints = hints_of(cls)
     return cls(**{key: convert(value, hints[key], f"{prefix}{key}") for key, value in values.items()})
 
 
@@ -207,7 +208,7 @@ def convert(value: Any, hint: Any, key: str, prefix: str = "") -> Any:
     if is_dataclass(hint):
         return build(hint, value, key)
     if is_typeddict(hint):
-        hints = _hints(hint)
+        hints = hints_of(hint)
         found = _mapping(value, key, lambda name: hints.get(name, Plain), prefix)
         if missing := [name for name in hints if name in hint.__required_keys__ and name not in found]:
             raise UserError(f"{key or 'it'} lacks {', '.join(missing)}.")
@@ -226,7 +227,7 @@ def is_whole(value: Any) -> bool:
 
 
 @cache
-def _hints(cls: type) -> dict[str, Any]:
+def hints_of(cls: type) -> dict[str, Any]:
     """The types of a class's fields by name."""
     hints = get_type_hints(cls, include_extras=True)
     return {

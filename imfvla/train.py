@@ -8,11 +8,11 @@ from imfvla.command import begin
 if __name__ == "__main__":
     begin()
 
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from imfvla.command.completion import is_complete
 from imfvla.command.composition import CONFIG_DIRECTORY
 from imfvla.command.entry import entry_point, output_directory
 from imfvla.storage.run_directory import RunDirectory
@@ -27,7 +27,14 @@ def usage() -> str:
     )
 
 
-@entry_point("train", is_complete, usage)
+def is_finished(config: dict[str, Any], directory: Path) -> bool:
+    """Whether a job of a sweep has nothing left to do."""
+    from imfvla.command.completion import is_complete  # late, as below
+
+    return is_complete(config, directory)
+
+
+@entry_point("train", is_finished, usage)
 def main(config: dict[str, Any]) -> None:
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.command.experiment import run_experiment

@@ -77,6 +77,8 @@ def write_evaluation(summary: Path, rollouts: Path, seed: int | None, episodes: 
     folder.mkdir(parents=True)
     (folder / EPISODES).write_text(text, encoding="utf-8")
     kept: dict[str, Any] = {key: said[key] for key in KEPT if key in said}
+    if latency := kept.get("latency_alone"):  # of the same weights
+        kept["latency_alone"] = latency | {key: protocol[key] for key in ("weights",) if key in latency}
     kept |= {"name": name, "seeds": [seeds[0], seeds[-1]], "protocol": protocol, DIGEST: digest_of(text)}
     (folder / "summary.json").write_text(json.dumps(kept), encoding="utf-8")
 

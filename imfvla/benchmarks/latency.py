@@ -10,12 +10,14 @@ from imfvla.environment import Environment
 from imfvla.policy import Policy
 from imfvla.process.stopwatch import times_ms
 from imfvla.reporting.bootstrap import bootstrap
+from imfvla.reporting.resampling import OfOrdered, middle
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.inference import observation_of
 from imfvla.rollouts.threads import threads
 from imfvla.types import tokenize
 
 FEWEST_CALLS = 50  # of a sampler with many steps
+LOG_MEDIAN = OfOrdered(lambda *counted: np.log(middle(*counted)))
 
 
 def measure_latency(
@@ -55,14 +57,10 @@ def measure_latency(
             measured[f"infer{number}"] = {
                 "median_ms": float(np.median(chunk)),
                 "p95_ms": float(np.percentile(chunk, 95)),
-                "log_error": bootstrap(_log_median, chunk).error or 0.0,
+                "log_error": bootstrap(LOG_MEDIAN, chunk).error or 0.0,
                 "encoder_ms": float(np.median(encoder)),
                 "core_evaluation_ms": float(np.median(core)),
                 "overhead_ms": float(np.median(chunk - parts)),
                 "of_parts": float(np.median(chunk / parts)),
             }
     return measured
-
-
-def _log_median(times: np.ndarray, axis: int) -> np.ndarray:
-    return np.log(np.median(times, axis=axis))

@@ -2,7 +2,9 @@
 
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -48,6 +50,18 @@ def is_lost(error: Exception) -> bool:
     return type(error).__name__ == LOST
 
 
+def remove_empty(directory: Path) -> None:
+    """Removes a folder below the working directory that holds nothing, and those above it that held nothing else.
+
+    So a job that is refused before it writes anything leaves no run directory, which Hydra makes for every job.
+    """
+    here = Path.cwd()
+    with suppress(OSError):  # it holds something
+        while directory.is_relative_to(here) and directory != here:
+            directory.rmdir()
+            directory = directory.parent
+
+
 class HydraJob:
     """Hydra's task function around `function(config)`: plain config in, None or a Failure out.
 
@@ -67,6 +81,7 @@ class HydraJob:
             self.function(composition.to_plain(config))
         except Exception as error:  # reported at the end, so that the other jobs of a sweep run
             self.failure = Failure.of(error, self.config_name, overrides)
+            remove_empty(Path(HydraConfig.get().runtime.output_dir))
         return self.failure
 
     def _refuse_hydras_own_ways(self, hydra: DictConfig) -> None:

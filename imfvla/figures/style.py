@@ -22,6 +22,7 @@ STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # where it is anyway; searching a free place takes a fifth of the time of a figure
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": GREY,

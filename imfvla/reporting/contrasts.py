@@ -12,6 +12,7 @@ from imfvla.reporting.estimates import log_pooled_mean, share_difference
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.power import detectable_difference, detectable_share_difference
+from imfvla.reporting.resampling import OfMeans
 from imfvla.reporting.rows import TIMING
 from imfvla.reporting.significance import mcnemar, sign_flip, signed_rank
 
@@ -87,7 +88,7 @@ def speedup(pairs: Pairs) -> Contrast:
     counts = pairs.columns(lambda row: len(row[TIMING]["inference_ms"]))
     totals = pairs.columns(lambda row: sum(row[TIMING]["inference_ms"]))
     ours, theirs = zip(totals, counts, strict=True)
-    found = bootstrap(_log_speedup, *pairs.policies(ours, theirs))
+    found = bootstrap(LOG_SPEEDUP, *pairs.policies(ours, theirs))
     if not np.isfinite(found.value):
         return Contrast(Measured(None), None, SIGN_FLIP, None)
     timed = np.all([np.all(count > 0, axis=0) for count in counts], axis=0)
@@ -97,7 +98,7 @@ def speedup(pairs: Pairs) -> Contrast:
 
 
 def _difference(pairs: Pairs, ours: np.ndarray, theirs: np.ndarray) -> Contrast:
-    found = bootstrap(_mean_difference, *pairs.policies((ours,), (theirs,)))
+    found = bootstrap(MEAN_DIFFERENCE, *pairs.policies((ours,), (theirs,)))
     p, test = _p_value(ours, theirs, found)
     detectable = detectable_difference(found.error, found.freedom) if found.error else None
     return Contrast(found.measured, p, test, detectable)
@@ -105,7 +106,7 @@ def _difference(pairs: Pairs, ours: np.ndarray, theirs: np.ndarray) -> Contrast:
 
 def _ratio(pairs: Pairs, key: str, tested: Contrast) -> Contrast:
     ours, theirs = pairs.columns(itemgetter(key))
-    found = bootstrap(_log_ratio, *pairs.policies((ours,), (theirs,)))
+    found = bootstrap(LOG_RATIO, *pairs.policies((ours,), (theirs,)))
     return Contrast(found.exponential, tested.p, tested.test, _detectable_ratio(found))
 
 
@@ -114,7 +115,7 @@ def _p_value(ours: np.ndarray, theirs: np.ndarray, found: Bootstrapped) -> tuple
     if max(len(ours), len(theirs)) == 1:
         return p, SIGN_FLIP
     of_seeds = (
-        2 * float(scipy.stats.t.sf(abs(found.value) / found.error, found.freedom)) if found.error else p
+        2 * float(scipy.special.stdtr(found.freedom, -abs(found.value) / found.error)) if found.error else p
     )
     return max(p, of_seeds), SEEDS
 
@@ -125,15 +126,14 @@ def _detectable_ratio(found: Bootstrapped) -> float | None:
     return math.exp(detectable_difference(found.error, found.freedom))
 
 
-def _mean_difference(ours: np.ndarray, theirs: np.ndarray, axis: int = -1) -> np.ndarray:
-    return ours.mean(axis=axis) - theirs.mean(axis=axis)
-
-
-def _log_ratio(ours: np.ndarray, theirs: np.ndarray, axis: int = -1) -> np.ndarray:
-    return np.log(ours.mean(axis=axis)) - np.log(theirs.mean(axis=axis))
+def _log_ratio(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    return np.log(ours) - np.log(theirs)
 
 
 def _log_speedup(
-    ours: np.ndarray, our_counts: np.ndarray, theirs: np.ndarray, their_counts: np.ndarray, axis: int = -1
+    ours: np.ndarray, our_counts: np.ndarray, theirs: np.ndarray, their_counts: np.ndarray
 ) -> np.ndarray:
-    return log_pooled_mean(theirs, their_counts, axis) - log_pooled_mean(ours, our_counts, axis)
+    return log_pooled_mean(theirs, their_counts) - log_pooled_mean(ours, our_counts)
+
+
+MEAN_DIFFERENCE, LOG_RATIO, LOG_SPEEDUP = OfMeans(np.subtract), OfMeans(_log_ratio), OfMeans(_log_speedup)

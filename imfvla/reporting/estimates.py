@@ -8,8 +8,11 @@ import math
 import numpy as np
 import scipy
 
-from imfvla.reporting.bootstrap import TAILS, Counted, Statistic, bootstrap
+from imfvla.reporting.bootstrap import TAILS, bootstrap
 from imfvla.reporting.measured import Measured
+from imfvla.reporting.resampling import OfMeans, OfOrdered, Statistic, middle, trimmed
+
+FEWEST_TRAININGS = 3  # that an interval of times is over
 
 
 def mean(values: np.ndarray) -> Measured:
@@ -28,11 +31,14 @@ def interquartile_mean(values: np.ndarray) -> Measured:
 def pooled_mean(totals: np.ndarray, counts: np.ndarray) -> Measured:
     """Mean of positive numbers of which episodes have several each, such as the times of their replannings.
 
-    The interval is over episodes and found on logarithms. Measured(None) without any number.
+    The interval is over episodes and found on logarithms. It is over training seeds too from three on: two say so
+    little about a third that the interval of a time, which hardly depends on the weights, would reach from a tenth of
+    it to ten times. Measured(None) without any number.
     """
     if not np.sum(counts):
         return Measured(None)
-    return bootstrap(log_pooled_mean, (totals, counts)).exponential
+    is_sample = len(np.atleast_2d(totals)) >= FEWEST_TRAININGS
+    return bootstrap(POOLED_MEAN, (totals, counts), over_seeds=is_sample).exponential
 
 
 def share(happened: np.ndarray) -> Measured:
@@ -45,11 +51,11 @@ def share(happened: np.ndarray) -> Measured:
     value = float(happened.mean())
     if len(happened) == 1:
         return Measured(value, *wilson_interval(int(happened.sum()), happened.size))
-    found = bootstrap(np.mean, happened)
-    trials, score = happened.shape[1], float(scipy.stats.norm.ppf(TAILS[1]))
+    found = bootstrap(MEAN, happened)
+    trials, score = happened.shape[1], float(scipy.special.ndtri(TAILS[1]))
     if found.error:
         trials = min(value * (1 - value) / found.error**2, happened.size)
-        score = float(scipy.stats.t.ppf(TAILS[1], found.freedom))
+        score = float(scipy.special.stdtrit(found.freedom, TAILS[1]))
     return Measured(value, *wilson_interval(value * trials, trials, score))
 
 
@@ -98,55 +104,19 @@ def _located(statistic: Statistic, values: np.ndarray) -> Measured:
     )
 
 
-def trimmed(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """The statistic of `interquartile_mean`."""
-    ordered = np.sort(values, axis=axis)  # of whole rows, which is faster here than to find their quarters
-    cut = int(0.25 * values.shape[axis])
-    kept = np.arange(cut, values.shape[axis] - cut)
-    return np.mean(np.take(ordered, kept, axis=axis), axis=axis)
+def trimmed_mean(values: np.ndarray) -> np.float64:
+    """The value of `interquartile_mean`."""
+    cut = int(0.25 * values.size)
+    return np.mean(np.sort(values)[cut : values.size - cut])
 
 
-def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """The median, sorted as in `trimmed`."""
-    number = values.shape[axis]
-    ordered = np.sort(values, axis=axis)
-    return np.mean(np.take(ordered, [(number - 1) // 2, number // 2], axis=axis), axis=axis)
+def log_pooled_mean(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """The statistic of `pooled_mean`, from the means of both."""
+    return np.log(totals) - np.log(counts)
 
 
-def _counted_mean(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    return column @ counts / column.size
-
-
-def _counted_median(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    ordered, reached = _cumulated(column, counts)
-    number = column.size
-    ends = ((reached <= place).sum(axis=0) for place in ((number - 1) // 2, number // 2))
-    return np.mean([ordered[end] for end in ends], axis=0)
-
-
-def _counted_trimmed(column: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    ordered, reached = _cumulated(column, counts)
-    cut = int(0.25 * column.size)
-    kept = np.clip(reached, cut, column.size - cut)
-    weights = np.diff(kept, axis=0, prepend=np.full((1, kept.shape[1]), cut, kept.dtype))
-    return ordered @ weights / (column.size - 2 * cut)
-
-
-def _cumulated(column: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The column ascending, and how many of each resample are there or before: (n,), (n, resamples)."""
-    order = np.argsort(column)
-    small = np.uint16 if column.size < 2**16 else np.int64
-    return column[order], np.cumsum(counts[order], axis=0, dtype=small)
-
-
-MEAN = Counted(np.mean, _counted_mean)
-MEDIAN = Counted(middle, _counted_median)
-INTERQUARTILE_MEAN = Counted(trimmed, _counted_trimmed)
-
-
-def log_pooled_mean(totals: np.ndarray, counts: np.ndarray, axis: int = -1) -> np.ndarray:
-    """The statistic of `pooled_mean`."""
-    return np.log(totals.sum(axis=axis)) - np.log(counts.sum(axis=axis))
+MEAN, POOLED_MEAN = OfMeans(lambda mean: mean), OfMeans(log_pooled_mean)
+MEDIAN, INTERQUARTILE_MEAN = OfOrdered(middle), OfOrdered(trimmed)
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:

@@ -52,13 +52,13 @@ def page(
     links = [(table.title, _id(table.title)) for table in tables]
     links += [("Figures", "figures"), ("Differences", "differ"), ("Rows", "rows")]
     navigation = "".join(f'<a href="#{target}">{html_text(name)}</a>' for name, target in links)
-    return (
+    head = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{TITLE}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>\n"
-        + "\n".join(sections)
-        + f"\n<script>\n{SCRIPT.read_text(encoding='utf-8')}</script></body></html>\n"
+        f"<style>\n{STYLE.read_text(encoding='utf-8')}</style></head>\n<body><h1>{TITLE}</h1>\n<nav>{navigation}</nav>"
     )
+    tail = f"<script>\n{SCRIPT.read_text(encoding='utf-8')}</script></body></html>\n"
+    return "\n".join((head, *sections, tail))  # once: it may have 100 MB
 
 
 def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
@@ -169,29 +169,19 @@ def _episodes(episodes: Sequence[Row]) -> str:
         "failure",
     )
     has_stages = any(row["first_step_of_stage"] for row in episodes)
-    names = [name for name in names if has_stages or name != STAGES]
-    heads = "".join(f'<th class="number">{name}</th>' for name in names)
-    lines = []
-    for row in episodes:
-        cells = (
-            row["seed"],
-            row["start_digest"],
-            f"{row['total_reward']:g}",
-            f"{row['max_reward']:g}",
-            "yes" if row["success"] else "no",
-            *_stages(row, has_stages),
-            row["failure"] or "-",
-        )
-        filled = "".join(f'<td class="number">{html_text(str(cell))}</td>' for cell in cells)
-        lines.append(f"<tr>{filled}</tr>")
-    table = f"<table><thead><tr>{''.join(heads)}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+    heads = "".join(f"<th>{name}</th>" for name in names if has_stages or name != STAGES)
+    lines = "".join(  # a report may have hundreds of thousands of them
+        f"<tr><td>{row['seed']}</td><td>{html_text(row['start_digest'])}</td><td>{row['total_reward']:g}</td>"
+        f"<td>{row['max_reward']:g}</td><td>{'yes' if row['success'] else 'no'}</td>"
+        f"{_stages(row) if has_stages else ''}<td>{html_text(row['failure']) if row['failure'] else '-'}</td></tr>"
+        for row in episodes
+    )
+    table = f'<table class="episodes"><thead><tr>{heads}</tr></thead><tbody>{lines}</tbody></table>'
     return f'<details><summary>{len(episodes)} episodes</summary><div class="scroll">{table}</div></details>'
 
 
-def _stages(row: Row, has_stages: bool) -> list[str]:
-    """The cell of the stages, where there are any."""
-    steps = ["-" if step < 0 else str(step) for step in row["first_step_of_stage"]]
-    return [" ".join(steps)] if has_stages else []
+def _stages(row: Row) -> str:
+    return f"<td>{' '.join('-' if step < 0 else str(step) for step in row['first_step_of_stage'])}</td>"
 
 
 def _anchor(name: str) -> str:

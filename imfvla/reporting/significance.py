@@ -20,7 +20,7 @@ def mcnemar(ours: np.ndarray, theirs: np.ndarray) -> float:
     only_ours, only_theirs = int((ours & ~theirs).sum()), int((theirs & ~ours).sum())
     if only_ours + only_theirs == 0:
         return 1.0
-    return float(scipy.stats.binomtest(only_ours, only_ours + only_theirs, 0.5).pvalue)
+    return min(1.0, 2 * float(scipy.special.bdtr(min(only_ours, only_theirs), only_ours + only_theirs, 0.5)))
 
 
 def sign_flip(differences: np.ndarray) -> float:
@@ -35,9 +35,7 @@ def sign_flip(differences: np.ndarray) -> float:
     if sizes.size <= MOST_EXACT:
         bits = np.arange(2**sizes.size)[:, None] >> np.arange(sizes.size) & 1
         return float((np.abs(2 * bits @ sizes - sizes.sum()) >= least).mean())
-    extreme, block = 0, FLIPS // 10
-    for bits in _flips(sizes.size, block):
-        extreme += int((np.abs(2 * (bits @ sizes) - sizes.sum()) >= least).sum())
+    extreme = sum(np.count_nonzero(np.abs(2 * sums - sizes.sum()) >= least) for sums in _flipped(sizes))
     return (extreme + 1) / (FLIPS + 1)
 
 
@@ -49,17 +47,24 @@ def signed_rank(differences: np.ndarray) -> float:
     """
     differences = np.asarray(differences, float)
     differences = differences[differences != 0]
-    return sign_flip(np.sign(differences) * scipy.stats.rankdata(np.abs(differences)))
+    _, place, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
+    ranks = np.cumsum(counts) - (counts - 1) / 2
+    return sign_flip(np.sign(differences) * ranks[place])
 
 
-def _flips(pairs: int, block: int) -> Iterator[np.ndarray]:
-    """The signs of all flips as 0 and 1, int8 (block, pairs) each."""
-    if pairs <= MOST_KEPT:
-        yield from _bits()[: FLIPS * pairs].reshape(-1, block, pairs)
-    else:
-        rng = np.random.default_rng(0)
-        for _ in range(FLIPS // block):
-            yield rng.integers(0, 2, (block, pairs), dtype=np.int8)
+def _flipped(sizes: np.ndarray) -> Iterator[np.ndarray]:
+    """For each flip, the sum of the sizes that it leaves positive, in some parts."""
+    if sizes.size <= MOST_KEPT:
+        for bits in _bits()[: FLIPS * sizes.size].reshape(-1, FLIPS // 10, sizes.size):
+            yield bits @ sizes
+        return
+    # The signs of eight pairs are a byte, and a table has the sum of each byte.
+    rng, sums = np.random.default_rng(0), np.zeros(FLIPS)
+    signs = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
+    for first in range(0, sizes.size, 8):
+        eight = sizes[first : first + 8]
+        sums += (signs[:, : eight.size] @ eight)[rng.integers(0, 256, FLIPS, dtype=np.uint8)]
+    yield sums
 
 
 @lru_cache(maxsize=1)

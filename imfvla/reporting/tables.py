@@ -23,7 +23,8 @@ PRINTED_FIELDS = [field.name for field in fields(PaperRow)][
 ]  # what it has beside table, method and setting
 INTERVALS = (
     "In brackets: 95% intervals; of counts Wilson's, of means and medians BCa bootstrap over episodes, with several "
-    "training seeds over these too. Latency: mean over all replannings, numpy to numpy."
+    "training seeds over these too. Latency: mean over all replannings, numpy to numpy; with two training "
+    "seeds its interval is over episodes alone."
 )
 
 

@@ -12,6 +12,7 @@ from imfvla.config.protocol import MAX_SEED
 from imfvla.errors import UserError
 from imfvla.options import Limit, Number, Plain, at_least, at_most, convert, one_of, within
 from imfvla.storage.documents import read_json
+from imfvla.storage.fitting import UNFIT, check_of
 
 LARGEST = 1e12  # of a reward or a time: their sums and squares are finite
 MAX_NAME = 200  # characters
@@ -117,6 +118,8 @@ Metrics = Annotated[Mapping[str, Number | None], at_most(MOST_METRICS)]
 
 def as_record(value: Any, hint: Any, where: str, remedy: str) -> Any:
     """`value` as the type `hint`. Raises UserError from `where`, a file or a line of it, to `remedy`."""
+    if (found := check_of(hint)(value)) is not UNFIT:
+        return found
     try:
         return convert(value, hint, "")
     except UserError as error:

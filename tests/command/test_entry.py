@@ -1,4 +1,5 @@
 import errno
+import logging
 import os
 import signal
 import subprocess
@@ -28,6 +29,7 @@ def command(config):
     if config["seed"] >= 100:
         os.kill(os.getpid(), config["seed"] - 100)
         signal.pause()
+    logging.getLogger("imfvla").info("begun")
     (output_directory() / "done").write_text(type(config["horizon"]).__name__)
 
 
@@ -36,7 +38,7 @@ def test_hands_plain_config_and_a_deterministic_directory(tmp_path):
     command(["+exp=socket_ph32_exec16"])
     assert (tmp_path / "runs/socket_ph32_exec16/default/done").read_text() == "dict"
     assert len(list(tmp_path.rglob("done"))) == 1
-    assert (tmp_path / "runs/socket_ph32_exec16/default/train.log").exists()
+    assert (tmp_path / "runs/socket_ph32_exec16/default/train.log").read_text().count(" INFO begun\n") == 2
     assert not list(tmp_path.rglob(".hydra"))
 
 
@@ -90,6 +92,18 @@ def test_our_own_mistakes_show_a_traceback(capfd):
     printed = capfd.readouterr().err
     assert "Traceback" in printed
     assert "a mistake of ours" in printed
+
+
+def test_a_refused_command_leaves_nothing(tmp_path):
+    for arguments in (["seed=1"], ["-m", "seed=1,1"]):
+        with pytest.raises(SystemExit):
+            command(arguments)
+        assert list(tmp_path.iterdir()) == []
+    (tmp_path / "runs/x").mkdir(parents=True)
+    (tmp_path / "runs/x/kept").touch()
+    with pytest.raises(SystemExit):
+        command(["name=x", "seed=1"])
+    assert [path.name for path in tmp_path.rglob("*")] == ["runs", "x", "kept"]
 
 
 def test_unknown_override_makes_no_directory(tmp_path):

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-SLOW = ("torch", "mujoco", "dm_control", "scipy.stats", "matplotlib", "cv2", "gymnasium")
+SLOW = ("torch", "mujoco", "dm_control", "scipy.special", "matplotlib", "cv2", "gymnasium")
 # Runs a command in this process and prints which slow modules it has imported.
 PROGRAM = f"""
 import importlib, sys

@@ -43,6 +43,18 @@ def test_a_pooled_mean_weighs_every_number_alike():
     assert estimates.pooled_mean(np.zeros(3), np.zeros(3)) == Measured(None)
 
 
+def test_times_of_two_trainings_have_the_interval_of_their_episodes():
+    """Student's t with one degree of freedom would stretch the difference of two machines' loads to 12.7 times."""
+    rng = np.random.default_rng(1)
+    counts = np.full(60, 20)
+    times = [counts * (ms + rng.normal(0, 1, 60)) for ms in (40, 60, 50)]
+    two, three = (estimates.pooled_mean(np.stack(times[:n]), np.stack([counts] * n)) for n in (2, 3))
+    assert two.value == pytest.approx(50, rel=0.01)
+    error = np.std(np.mean(times[:2], axis=0) / 20, ddof=1) / np.sqrt(60)
+    assert (two.value - two.low, two.high - two.value) == pytest.approx((1.96 * error, 1.96 * error), rel=0.1)
+    assert three.low < 40 < 60 < three.high
+
+
 def test_a_share_has_wilson_s_interval():
     happened = np.arange(100) < 44
     assert estimates.share(happened) == Measured(0.44, *wilson_interval(44, 100))
@@ -88,4 +100,6 @@ def test_two_policies_that_always_succeed_may_still_differ():
 
 def test_the_interquartile_mean_is_scipy_s():
     values = np.random.default_rng(0).gamma(2, size=37)
-    assert estimates.interquartile_mean(values).value == stats.trim_mean(values, 0.25)
+    assert estimates.interquartile_mean(values).value == pytest.approx(
+        stats.trim_mean(values, 0.25), rel=1e-12
+    )

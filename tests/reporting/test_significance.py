@@ -58,6 +58,17 @@ def test_many_sign_flips_against_the_normal_law():
     assert sign_flip(differences) == pytest.approx(2 * stats.norm.sf(abs(score)), rel=0.05)
 
 
+@pytest.mark.parametrize("number", [17, 20, 21])
+def test_signs_of_eight_pairs_at_once_are_signs_of_pairs(monkeypatch, number):
+    monkeypatch.setattr(significance, "MOST_KEPT", 16)
+    differences = np.random.default_rng(number).normal(0.4, 1, number)
+    found = sign_flip(differences)
+    monkeypatch.undo()
+    monkeypatch.setattr(significance, "MOST_EXACT", number)
+    exact = sign_flip(differences)
+    assert found == pytest.approx(exact, abs=4 * np.sqrt(exact / significance.FLIPS))
+
+
 def test_holm_against_r():
     p = [0.01, 0.04, 0.03, 0.005]  # p.adjust(p, "holm") in R 4.4
     assert holm(p) == pytest.approx([0.03, 0.06, 0.06, 0.02])
