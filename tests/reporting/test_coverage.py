@@ -37,7 +37,7 @@ def test_bca_of_a_paired_difference(rng, few_resamples):
     def sample():
         start = rng.gamma(2, size=EPISODES)  # how hard it is, for both
         ours, theirs = 3 * start + rng.normal(size=EPISODES), 2 * start + rng.gamma(1, size=EPISODES)
-        return bootstrap.bootstrap(np.mean, ours - theirs)
+        return bootstrap.bootstrap(estimates.MEAN, ours - theirs)
 
     assert 0.93 <= coverage(sample, 3 * 2 - 2 * 2 - 1) <= 0.97
 
