@@ -114,13 +114,15 @@ def fastest_ms(functions: list[Callable[[], object]], rounds: int) -> list[float
     return [min(times) for times in taken]
 
 
-def measure(name: str, experiment: str, precision: str, rounds: int, compiles: bool) -> list[tuple[str, ...]]:
+def measure(name: str, options: argparse.Namespace, precision: str) -> list[tuple[str, ...]]:
     """Rows of the table for one case: what a step takes, its ratio, what compiling took."""
     extra, share = CASES[name]
-    attnres = [f"+exp={experiment}", *extra]
-    kinds = [("eager", attnres, False), ("eager, fixed residuals", [*attnres, FIXED], False)]
-    if compiles:
-        kinds += [("compiled", attnres, True), ("compiled, fixed residuals", [*attnres, FIXED], True)]
+    attnres = [f"+exp={options.experiment}", *extra]
+    kinds = [("eager", attnres, False)]
+    if options.compile:
+        kinds.append(("compiled", attnres, True))
+    if options.fixed:
+        kinds += [(f"{kind}, fixed residuals", [*attnres, FIXED], compiled) for kind, _, compiled in kinds]
     functions, compiling = [], []
     for kind, overrides, compiled in kinds:
         function, began = stepper(overrides, share, precision, compiled), Spent.now()
@@ -129,7 +131,7 @@ def measure(name: str, experiment: str, precision: str, rounds: int, compiles: b
         compiling.append(f"{spent.own:.0f} + {spent.children:.0f}" if compiled else "")
         functions.append(function)
         print(f"{name}, {kind}: first step after {spent.own:.0f} + {spent.children:.0f} s", file=sys.stderr)
-    times = fastest_ms(functions, rounds)
+    times = fastest_ms(functions, options.rounds)
     return [
         (name, kind, number(taken, 0), number(taken / times[0], 2), spent)
         for (kind, *_), taken, spent in zip(kinds, times, compiling, strict=True)
@@ -144,6 +146,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--experiment", default="transfer_ph32_exec16")
     parser.add_argument("--only", choices=CASES, action="append", help="of the cases; all where not said")
     parser.add_argument("--compile", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument(
+        "--fixed", action=argparse.BooleanOptionalAction, default=True, help="fixed residuals too"
+    )
     parser.add_argument("--cold", action="store_true", help="take no code from earlier runs")
     parser.add_argument("--rounds", type=int, default=12)
     options = parser.parse_args(arguments)
@@ -154,7 +159,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.cold:
             os.environ[CACHE] = scratch
         for name in options.only or CASES:
-            rows += measure(name, options.experiment, precision, options.rounds, options.compile)
+            rows += measure(name, options, precision)
     columns = ("Case", "Step", "ms", "Ratio to eager", "Compiling [s], own + children")
     Table(f"{options.experiment}, {precision}, one thread", columns, tuple(rows)).print()
     return 0
