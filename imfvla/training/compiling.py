@@ -1,8 +1,8 @@
 """Whether a training runs compiled code (`nn/compiled.py`): true, false, or auto, where that saves time.
 
 auto runs the first steps as they are written and times them. If the rest would take more than `WORTH_S`, code is
-compiled from the next step on: that takes a minute or two once, and saves a quarter of a step. The state keeps
-the decision, so that a resumed run equals an uninterrupted one.
+compiled from the next step on: that takes a minute or two once, and saves a quarter of a step. The state keeps the
+decision, so that a resumed run equals an uninterrupted one.
 """
 
 import logging
