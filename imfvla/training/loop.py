@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-from imfvla.nn.compiled import compile_parts
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped, deferred_stop
 from imfvla.storage.fingerprint import fingerprint, physical_cores
@@ -25,6 +24,7 @@ from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.accumulation import add_gradients
 from imfvla.training.checkpoint import save_weights
 from imfvla.training.clipping import Clipping
+from imfvla.training.compiling import EAGER, Compiling
 from imfvla.training.ema import Ema
 from imfvla.training.logger import MetricsLogger, SilentLogger
 from imfvla.training.non_finite import NonFinite, name_cause
@@ -103,20 +103,21 @@ class Trainer:
         self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
         self.origin = Origin(self.description.get("config"))
         precision: str | None = None
+        compiling: str | None = None
         if run.last_state.exists():
             details = load_state(run.last_state, self.state)
             self.origin.resume(details, run.last_state)
             self.step = self.saved_step = details["step"]
             self.train_s, self._logger_state = details["train_s"], details["logger"]
             precision, self.clipping.scale = details["precision"], details["gradient_scale"]
+            compiling = details.get("compiling", EAGER)  # states without it are older than auto
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         precision = precision or choose_precision(options.precision, self.device)
         self.precision = self.processes.first_of(PRECISIONS, precision)
         allow_tf32(self.precision)
         self.non_finite = NonFinite(options.on_non_finite)
-        if options.compile:
-            compile_parts(self.policy)
+        self.compiling = Compiling(options, self.policy, self.device, self.processes, compiling)
 
     @property
     def is_finished(self) -> bool:
@@ -138,6 +139,7 @@ class Trainer:
         with (
             deferred_stop() as self._stop,
             closing(self.batches),
+            closing(self.compiling),
             closing(logger),
             Progress(
                 "training", self.options.steps, done=self.step, shown=self.processes.is_first
@@ -152,8 +154,10 @@ class Trainer:
         while not self.is_finished:
             before = time.perf_counter()
             batch = next(self.batches)
-            waited += time.perf_counter() - before
+            received = time.perf_counter()
+            waited += received - before
             scalars = self._update(batch)
+            self.compiling.took(time.perf_counter() - received, self.step)
             if scalars is None:
                 logger.skip()
                 scalars = {"loss": math.nan}
@@ -270,6 +274,7 @@ class Trainer:
             "step": self.step,
             "train_s": self.train_s,
             "precision": self.precision,
+            "compiling": self.compiling.mode,
             "gradient_scale": self.clipping.scale,
             "batches": self.batches.state_dict(),
             "logger": logger.state(),

@@ -58,7 +58,7 @@ def _is_finite(policy: nn.Module, batch: Batch, seed: int, row: int, size: int) 
     torch.manual_seed(seed)
     rng = torch.Generator(batch.actions.device).manual_seed(seed)
     policy.zero_grad(set_to_none=True)
-    with WholeBatchDraws(rng, 1, row, size):
+    with WholeBatchDraws(rng, 1, row, size), torch.compiler.set_stance("force_eager"):
         loss, _ = policy.loss(rows(batch, slice(row, row + 1)), rng)
     if not math.isfinite(loss.item()):
         release(policy)

@@ -26,7 +26,7 @@ class TrainingOptions:
     prefetch: Annotated[int, within(1, MAX_PREFETCH)]  # batches prepared ahead
     loader_threads: Annotated[int, within(1, MAX_THREADS)]  # that prepare them
     precision: Annotated[str, one_of("fp32", "tf32", "bf16", "auto")]
-    compile: bool
+    compile: Annotated[bool | str, one_of(True, False, "auto")]
     device: Annotated[str, one_of("cpu", "cuda", "auto")]
     # Of OpenMP in a process; None for its share of the cores.
     threads: Annotated[int, within(1, MAX_THREADS)] | None

@@ -107,8 +107,11 @@ class Shared(Alone):
 
     def check(self, options: TrainingOptions) -> None:
         _refuse_parts(options, self.size)
-        if options.compile:
-            raise UserError(f"training.compile must be false with several processes, found {self.size}.")
+        if options.compile is True and options.sharding != NONE:
+            raise UserError(
+                f"training.compile must be auto or false with training.sharding={options.sharding}, found true: "
+                "PyTorch compiles code anew for weights that are gathered in each step."
+            )
 
     def mean(self, values: Sequence[float]) -> list[float]:
         total = torch.tensor(values, dtype=torch.float64, device=_device())
@@ -182,11 +185,6 @@ def _refuse_parts(options: TrainingOptions, processes: int) -> None:
         )
         raise UserError(
             f"training.batch_size must be a multiple of {' times '.join(among)}, found {options.batch_size}."
-        )
-    if options.compile and parts > 1:
-        raise UserError(
-            f"training.compile must be false with training.accumulate={parts}: random numbers of parts are drawn under "
-            "a mode in which torch compiles nothing."
         )
 
 

@@ -15,6 +15,7 @@ from imfvla.options import Number, Plain, at_most, one_of, within
 from imfvla.storage.documents import parse_json
 from imfvla.storage.files import delete_leftovers, write_atomically
 from imfvla.storage.records import Code, Duration, Step, as_record
+from imfvla.training.compiling import MODES
 from imfvla.training.precision import PRECISIONS
 from imfvla.training.sharding import fill, gathered
 from imfvla.training.tensor_files import num_bytes, read_tensors, refuse_misfits, write_tensors
@@ -44,6 +45,7 @@ class Details(TypedDict):
     step: Step
     train_s: Duration
     precision: Annotated[str, one_of(*PRECISIONS)]
+    compiling: NotRequired[Annotated[str, one_of(*MODES)] | None]  # None before it is decided
     # Of the gradients; None where every step so far was left out.
     gradient_scale: Annotated[float, within(0, 1e300)] | None
     batches: Mapping[str, Plain]  # checked by those who load it

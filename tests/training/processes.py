@@ -8,17 +8,21 @@ import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import torch
 from safetensors.torch import load_file
 from tiny_policy import OPTIM, OPTIONS, CountedBatches, TinyPolicy
 
+from imfvla.nn.compiled import compile_parts
 from imfvla.process.signals import Stopped
 from imfvla.sources.mcap import McapSource
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.training import compiling
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
@@ -34,6 +38,7 @@ class Job:
     nan_in: int | None = None  # batch with a row that is not finite
     overrides: list[str] | None = None
     demos: str = ""
+    backend: str | None = None  # of compiled code
 
 
 class FaultyBatches(CountedBatches):
@@ -94,7 +99,8 @@ def composed_parts(job: Job) -> tuple[Any, ...]:
 
 def train(job: Job, processes: Alone) -> int:
     """Trains until the end or until it is asked to stop; returns the step that it began from."""
-    trainer = make_trainer(job, processes)
+    with patch.object(compiling, "compile_parts", partial(compile_parts, backend=job.backend)):
+        trainer = make_trainer(job, processes)
     began = trainer.step
     with suppress(Stopped):
         trainer.train()

@@ -99,8 +99,6 @@ def test_a_batch_that_has_no_such_parts_is_refused():
         Alone().check(replace(OPTIONS, accumulate=3))
     with pytest.raises(UserError, match=r"multiple of the 2 processes times training.accumulate=8, found 8"):
         Shared(0, 2, 2).check(replace(OPTIONS, accumulate=8))
-    with pytest.raises(UserError, match=r"compile must be false with training.accumulate=2"):
-        Alone().check(replace(OPTIONS, accumulate=2, compile=True))
     Shared(0, 2, 2).check(replace(OPTIONS, accumulate=4))
 
 

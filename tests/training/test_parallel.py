@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from processes import Job, assert_close, launch, train
+from synthetic import write_demonstrations
 from tiny_policy import OPTIONS, CountedBatches
 from torch.nn import functional as F
 
@@ -22,6 +23,20 @@ def test_two_processes_equal_one_and_one_resumes_from_what_they_began(tmp_path, 
     assert_close(tmp_path / "two", tmp_path / "one")
     assert train(Job(str(tmp_path / "mixed")), Alone()) == 3
     assert_close(tmp_path / "mixed", tmp_path / "one")
+
+
+def test_compiled_code_computes_in_shares_and_parts_what_the_whole_computes_eagerly(tmp_path):
+    """Two processes with two parts of a batch each."""
+    sizes = ["size.width=32", "size.heads=2", "size.depth=2", "observation.image_size=[32,32]"]
+    options = ["batch_size=4", "steps=2", "checkpoints=1", "log_every=1", "threads=1", "precision=fp32"]
+    overrides = [*sizes, *(f"training.{option}" for option in options)]
+    demos = str(write_demonstrations(tmp_path / "demonstrations"))
+    eager = Job(str(tmp_path / "eager"), overrides=overrides, demos=demos)
+    train(eager, Alone())
+    compiled = [*overrides, "training.compile=true", "training.accumulate=2"]
+    job = replace(eager, run=str(tmp_path / "compiled"), overrides=compiled, backend="aot_eager")
+    launch([job], tmp_path / "jobs.json")
+    assert_close(tmp_path / "compiled", tmp_path / "eager", steps=2)
 
 
 @pytest.mark.parametrize("func", [torch.rand, torch.randn])
@@ -100,9 +115,11 @@ def test_gradients_of_shares_average_to_those_of_the_batch(generator):
 def test_a_batch_that_cannot_be_shared_out_is_refused():
     with pytest.raises(UserError, match=r"batch_size must be a multiple of the 3 processes, found 8"):
         Shared(0, 3, 3).check(OPTIONS)
-    with pytest.raises(UserError, match=r"training\.compile must be false with several processes"):
-        Shared(0, 2, 2).check(replace(OPTIONS, compile=True))
+    with pytest.raises(
+        UserError, match=r"compile must be auto or false with training\.sharding=full, found true"
+    ):
+        Shared(0, 2, 2).check(replace(OPTIONS, compile=True, sharding="full"))
     with pytest.raises(UserError, match=r"training\.sharding=full needs several processes, found one"):
         Alone().check(replace(OPTIONS, sharding="full"))
-    Alone().check(replace(OPTIONS, batch_size=7, compile=True))
+    Alone().check(replace(OPTIONS, batch_size=7))
     assert len(Shared(1, 2, 2).share(next(CountedBatches())).actions) == 4
