@@ -35,7 +35,10 @@ def compile_parts(policy: nn.Module, backend: str = "inductor") -> bool:
                 "no C++ compiler was found, so nothing is compiled: install g++ for training.compile=true"
             )
             return False
-        os.environ.setdefault(CACHE, str(cache_directory()))
+        from torch._inductor.runtime.cache_dir_utils import default_cache_dir  # here, since it takes a second
+
+        if os.environ.get(CACHE, default_cache_dir()) == default_cache_dir():  # as inductor may have set it
+            os.environ[CACHE] = str(cache_directory())
         log.info(
             f"compiling: the next steps take a minute or two, or seconds where {os.environ[CACHE]} has their code"
         )
