@@ -6,7 +6,8 @@ python tools/grasps.py experiments/pretrained/socket_ph32_exec16/default --play 
 
 The first plays the expert, stops before each closing and prints where the policy's chunk would close: its error, and by
 how much that place follows the object and the hand where one of them is moved 1 cm aside or turned by 10 degrees. One
-that looks follows the object (1) and not the hand (0); one that goes on from where it is follows the hand alone.
+that looks follows the object (1) and not the hand (0); one that goes on from where it is follows the hand alone. Then
+how well chunks early in the approach turn the hands, beside a guess of the same way for all starts.
 The second plays the policy and prints how high, how far aside and how much turned hands close, and which grasps fail;
 with --given-grasps the expert plays until the objects are held.
 """
@@ -29,7 +30,7 @@ from imfvla.environments.rollout import run_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
 from imfvla.modes.recordings import settings_of
-from imfvla.modes.sight import LEADS, MIDDLE, half_turns, picks_of, probe
+from imfvla.modes.sight import LEADS, MIDDLE, foresee, half_turns, picks_of, probe
 from imfvla.process.progress import Progress
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.workbench import load_workbench
@@ -121,6 +122,15 @@ def print_aims(rows: list[dict[str, float]]) -> None:
         )
 
 
+def print_turns(rows: list[dict[str, float]]) -> None:
+    print("hand   step of the decision    n  turned [deg], rms  a guess")
+    for side, step in sorted({(row["hand"], row["step"]) for row in rows}):
+        chosen = [row for row in rows if (row["hand"], row["step"]) == (side, step)]
+        rms = np.degrees(np.sqrt(np.mean([row["turned"] ** 2 for row in chosen])))
+        guess = np.degrees(np.std([row["wanted"] for row in chosen]))
+        print(f"{side:6} {step:20d} {len(chosen):4d} {rms:18.1f} {guess:8.1f}")
+
+
 def print_closings(found: list[tuple[bool, dict[str, tuple]]]) -> None:
     print(f"{sum(success for success, _ in found)} successes of {len(found)}")
     for side in sorted({side for _, rows in found for side in rows}):
@@ -162,7 +172,7 @@ def main() -> int:
             f"The policy must see one step and predict more than {max(LEADS)}, found {policy.horizon}."
         )
     actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
-    seeds, found = range(arguments.first_seed, arguments.first_seed + episodes), []
+    seeds, found, early = range(arguments.first_seed, arguments.first_seed + episodes), [], []
     with Progress("episodes", episodes) as progress:
         for seed in seeds:
             if arguments.play:
@@ -174,8 +184,13 @@ def main() -> int:
                 env.reset(seed)
                 actor.reset(env, seed)
                 found += probe(env, expert, partial(_plan, actor, policy.views), seed)
+                early += foresee(env, expert, partial(_plan, actor, policy.views), seed)
             progress.advance()
-    (print_closings if arguments.play else print_aims)(found)
+    if arguments.play:
+        print_closings(found)
+    else:
+        print_aims(found)
+        print_turns(early)
     return 0
 
 

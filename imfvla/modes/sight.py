@@ -17,6 +17,10 @@ from imfvla.tasks.experts.hand import ARM, GRIPPER
 from imfvla.tasks.kinematics import about_z, yaw_of
 
 LEADS = (4, 8, 16, 31)  # control steps before the closing
+EARLY, AHEAD = (
+    (16, 24, 32),
+    31,
+)  # control steps of the approach, and how far on the expert has turned its hands
 ASIDE, TURN = 0.01, np.radians(10)
 MIDDLE = 0.5  # of a gripper's opening
 MOST_STEPS = 300  # of an expert that has not closed its hands
@@ -82,6 +86,34 @@ def probe(env: BimanualEnvironment, expert: Expert, plan: Plan, seed: int) -> li
         for lead in (lead for lead in LEADS if closed.any() and lead <= closes):
             aim = partial(_aim, env, expert, plan, states[closes - lead], side, lead)
             rows.append({"hand": side, "lead": lead} | _measure(env, expert, side, pick, aim))
+    return rows
+
+
+def foresee(env: BimanualEnvironment, expert: Expert, plan: Plan, seed: int) -> list[dict[str, float]]:
+    """Plays the expert from `seed` and asks `plan` early in the approach: one row for each hand and step.
+
+    How a hand is turned in the chunk's entry AHEAD against the expert's action there [rad], and the latter, `wanted`.
+    Later than the hand's closing nothing is said.
+    """
+    env.reset(seed)
+    expert.reset(env, seed)
+    chunks, actions = {}, []
+    for step in range(EARLY[-1] + AHEAD + 1):
+        if step in EARLY:
+            chunks[step] = plan(env.look(), env.state())
+        decision = expert.act(env, env.state(), step)
+        actions.append(decision.action)
+        env.step(decision.executed)
+    rows = []
+    for side, hand in expert.hands.items():
+        for step, chunk in chunks.items():
+            said, done = chunk[AHEAD], actions[step + AHEAD]
+            if done[GRIPPER[side]] > MIDDLE:
+                yaws = [
+                    yaw_of(hand._kinematics.pose(np.float64(one[ARM[side]])).rotation) for one in (said, done)
+                ]
+                turned, wanted = half_turns(yaws[0] - yaws[1]), half_turns(yaws[1] - np.pi / 2)
+                rows.append({"hand": side, "step": step, "turned": turned, "wanted": wanted})
     return rows
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
-from imfvla.modes.sight import LEADS, Pick, half_turns, picks_of, probe
+from imfvla.modes.sight import AHEAD, EARLY, LEADS, Pick, foresee, half_turns, picks_of, probe
 from imfvla.tasks.bimanual import Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts import make_expert
@@ -75,6 +75,30 @@ def test_one_that_sees_the_object_follows_it_alone(env, expert):
         assert abs(row["aside"]) < 1e-3
         assert abs(row["above"]) < 1e-3
         assert abs(row["turned"]) < 0.01
+
+
+def test_early_chunks_are_compared_with_what_the_expert_does(env, expert):
+    commands = []
+    env.reset(SEED)
+    expert.reset(env, SEED)
+    for step in range(EARLY[-1] + AHEAD + 1):
+        commands.append(expert.act(env, env.state(), step).action)
+        env.step(commands[-1])
+    coming = iter(EARLY)
+
+    def plan(images: dict[str, np.ndarray], state: np.ndarray) -> np.ndarray:
+        step = next(coming)
+        chunk = np.array(commands[step : step + AHEAD + 1])
+        chunk[:, 6] += 0.1  # the left wrist's roll, about the vertical
+        return chunk
+
+    rows = foresee(env, expert, plan, SEED)
+    assert {row["hand"] for row in rows} == set(ARM)
+    for row in rows:
+        assert abs(row["turned"]) == pytest.approx(0.1 if row["hand"] == "left" else 0, abs=0.005)
+    yaw = {side: pick.goal(env).rotation for side, pick in picks_of(env, expert).items()}
+    last = {row["hand"]: row["wanted"] for row in rows}
+    assert all(last[side] == pytest.approx(yaw_of(yaw[side]), abs=0.02) for side in last)
 
 
 def test_half_a_turn_is_none_to_a_gripper():
