@@ -55,6 +55,7 @@ class ExpertOptions:
     hold: int
     dwell: int
     recoveries: float = 0  # older than runs without it
+    pushes: int = 0  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ class BimanualSettings:
     hold: int
     dwell: int
     recoveries: float
+    pushes: int
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -77,15 +79,16 @@ class BimanualSettings:
         height, width = self.image_size
         waiting = f"-dwell{self.dwell}" if self.dwell else ""
         missing = f"-recoveries{self.recoveries:g}" if self.recoveries else ""
-        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}-{height}x{width}"
+        pushed = f"-pushes{self.pushes}" if self.pushes else ""
+        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}{pushed}-{height}x{width}"
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         return (self.image_size,) * len(self.views)
 
     def to_json(self) -> dict[str, Any]:
-        """Without `recoveries` where there are none: such recordings have the bytes that they had before."""
-        return {key: value for key, value in asdict(self).items() if key != "recoveries" or value}
+        """Without `recoveries` and `pushes` where there are none: recordings have the bytes that they had before."""
+        return {k: value for k, value in asdict(self).items() if k not in ("recoveries", "pushes") or value}
 
     def build(self) -> tuple[Environment, Actor]:
         from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
@@ -103,6 +106,7 @@ class BimanualSettings:
             hold=self.hold,
             dwell=self.dwell,
             recoveries=self.recoveries,
+            pushes=self.pushes,
         )
 
 
