@@ -55,7 +55,6 @@ class ExpertOptions:
     hold: int
     dwell: int
     recoveries: float = 0  # older than runs without it
-    pushes: int = 0  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +68,6 @@ class BimanualSettings:
     hold: int
     dwell: int
     recoveries: float
-    pushes: int
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -79,16 +77,15 @@ class BimanualSettings:
         height, width = self.image_size
         waiting = f"-dwell{self.dwell}" if self.dwell else ""
         missing = f"-recoveries{self.recoveries:g}" if self.recoveries else ""
-        pushed = f"-pushes{self.pushes}" if self.pushes else ""
-        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}{pushed}-{height}x{width}"
+        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}-{height}x{width}"
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         return (self.image_size,) * len(self.views)
 
     def to_json(self) -> dict[str, Any]:
-        """Without `recoveries` and `pushes` where there are none: recordings have the bytes that they had before."""
-        return {k: value for k, value in asdict(self).items() if k not in ("recoveries", "pushes") or value}
+        """Without `recoveries` where there are none: such recordings have the bytes that they had before."""
+        return {key: value for key, value in asdict(self).items() if key != "recoveries" or value}
 
     def build(self) -> tuple[Environment, Actor]:
         from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
@@ -106,7 +103,6 @@ class BimanualSettings:
             hold=self.hold,
             dwell=self.dwell,
             recoveries=self.recoveries,
-            pushes=self.pushes,
         )
 
 

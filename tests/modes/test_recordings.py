@@ -43,9 +43,7 @@ def test_a_folder_without_what_is_wanted_is_refused(folder, tmp_path):
 
 def test_a_run_from_before_a_setting_is_read_as_it_was(folder):
     expert = {
-        key: value
-        for key, value in CONFIG["task"]["expert"].items()
-        if key not in ("dwell", "recoveries", "pushes")
+        key: value for key, value in CONFIG["task"]["expert"].items() if key not in ("dwell", "recoveries")
     }
     old = {**CONFIG, "task": {**CONFIG["task"], "expert": expert}}
     assert settings_of(old) == settings_of(CONFIG)

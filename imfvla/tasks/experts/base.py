@@ -1,7 +1,7 @@
 """What the scripted experts share: style drawn from the seed, one controlled hand per arm, action noise.
 
 An expert decides from the measured state alone, not from a clock, so that a policy that sees one frame can learn it.
-Only a grasp that fails on purpose and a push are not of this kind, and their steps are marked as nothing to imitate.
+Only a grasp that fails on purpose is not of this kind, and its steps are marked as nothing to imitate.
 """
 
 from collections.abc import Mapping
@@ -15,14 +15,12 @@ from imfvla.tasks.bimanual import SIDES, Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
 from imfvla.tasks.experts.hand import ARM, Hand
 from imfvla.tasks.experts.miss import Miss
-from imfvla.tasks.experts.push import Pushes
 from imfvla.tasks.kinematics import ArmKinematics, about_z
 
 SPEED = 0.125  # m/s
 GRASP_HEIGHT = 0.014  # of the point between the fingertips above the table
 NOISE_CORRELATION = 0.9  # of the action noise from one control step to the next
-_STYLE_STREAM, _NOISE_STREAM, _MISS_STREAM, _PUSH_STREAM = 11, 12, 13, 14
-MOST_PUSHES = 10
+_STYLE_STREAM, _NOISE_STREAM, _MISS_STREAM = 11, 12, 13
 
 
 class Expert:
@@ -38,8 +36,6 @@ class Expert:
             waits for nothing. Nothing in the observation shows how long it will wait.
         recoveries: share of the demonstrations in which a first grasp fails and the expert grasps again; which ones is
             drawn from the seed. Until the last hand that missed goes back, steps are marked as nothing to imitate.
-        pushes: how often each hand is pushed aside on its way down to what it grasps from the table. Steps at which a
-            hand is pushed are marked as nothing to imitate.
     """
 
     task_name: str
@@ -47,9 +43,7 @@ class Expert:
     # which hands may miss, the one or the other or both together; one is drawn
     misses: tuple[tuple[str, ...], ...] = (("right",),)
 
-    def __init__(
-        self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0, pushes: int = 0
-    ) -> None:
+    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0) -> None:
         if modes not in (1, 2, 4):
             raise UserError(f"task.expert.modes must be 1, 2 or 4, found {modes!r}.")
         if not 0 <= noise <= 0.05:
@@ -65,12 +59,8 @@ class Expert:
             raise UserError(
                 f"task.expert.recoveries is a share of the demonstrations, 0 to 1, found {recoveries!r}."
             )
-        if pushes not in range(MOST_PUSHES + 1):
-            raise UserError(
-                f"task.expert.pushes is a whole number from 0 to {MOST_PUSHES} for each hand, found {pushes!r}."
-            )
         self.modes, self.noise, self.hold, self.dwell = modes, noise, hold, dwell
-        self.recoveries, self.pushes = recoveries, pushes
+        self.recoveries = recoveries
         self.style: dict[str, Any] = {}
         self.hands: dict[str, Hand] = {}
 
@@ -103,8 +93,6 @@ class Expert:
         self._misses = {side: Miss(side, rng) for side in missing}
         if missing:
             self.style["missed"] = list(missing)
-        rng = np.random.default_rng(np.random.SeedSequence([seed, _PUSH_STREAM]))
-        self._pushes = {side: Pushes(self.pushes, rng) for side in SIDES}
         self._noise_rng = np.random.default_rng(np.random.SeedSequence([seed, _NOISE_STREAM]))
         self._disturbance = np.zeros(len(env.robot.action))
         self._limits = tuple(np.float32(limits) for limits in (env.robot.action_min, env.robot.action_max))
@@ -119,14 +107,12 @@ class Expert:
         raise NotImplementedError
 
     def act(self, env: BimanualEnvironment, state: np.ndarray, step: int) -> Decision:
-        """The clean action, and what is executed: the same with smooth joint noise, or a push."""
+        """The clean action, and the same with smooth joint noise to be executed."""
         for hand in self.hands.values():
             hand.measure(env, state)
-        goes_right = all(miss.over for miss in self._misses.values())
-        self._pushed: dict[str, np.ndarray] = {}
+        # Of a demonstration without a miss nothing is said.
+        imitate = all(miss.over for miss in self._misses.values()) if self._misses else None
         self.command(env, self.task.contacts(env.physics))
-        # Of a demonstration in which nothing goes wrong nothing is said.
-        imitate = goes_right and not self._pushed if self._misses or self.pushes else None
         clean = np.concatenate([self.hands[side].command for side in SIDES])
         fresh = self._noise_rng.standard_normal(len(self._disturbance))
         self._disturbance = NOISE_CORRELATION * self._disturbance + np.sqrt(1 - NOISE_CORRELATION**2) * fresh
@@ -134,8 +120,6 @@ class Expert:
         for side in SIDES:
             scale[ARM[side]] = self.noise * self.hands[side].freedom
         disturbed = clean + scale * self._disturbance
-        for side, command in self._pushed.items():
-            disturbed[ARM[side]] = command[:-1]
         clean, disturbed = (np.clip(a, *self._limits).astype(np.float32) for a in (clean, disturbed))
         return Decision(action=clean, executed=disturbed, imitate=imitate)
 
@@ -158,7 +142,4 @@ class Expert:
             carried = Pose(bring + grasp, about_z(self.turn[hand.side] * np.pi / 2))
             miss.play(hand, goal, carried, self.height, self.speed)
         else:
-            pushed = self._pushes[hand.side].command(hand, goal)
-            if pushed is not None:
-                self._pushed[hand.side] = pushed
             hand.reach(goal, self.height, self.speed, reopens=miss is not None)

@@ -13,10 +13,8 @@ from imfvla.tasks.experts.transfer import TransferExpert
 class CombinedExpert:
     """An `episode.Actor` with the arguments of `Expert`."""
 
-    def __init__(
-        self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0, pushes: int = 0
-    ) -> None:
-        shared = {"modes": modes, "noise": noise, "hold": hold, "recoveries": recoveries, "pushes": pushes}
+    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0) -> None:
+        shared = {"modes": modes, "noise": noise, "hold": hold, "recoveries": recoveries}
         self._experts = {
             "socket": SocketExpert(**shared, dwell=0),
             "transfer": TransferExpert(**shared, dwell=dwell),
