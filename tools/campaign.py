@@ -39,7 +39,7 @@ from imfvla.storage.files import locked, put_folder
 from imfvla.storage.run_directory import RunDirectory
 
 RESULTS, LOGS = Path("experiments/results"), Path("runs/campaign")
-ALONG_OTHERS = ("training.threads=1", "evaluation.workers=1", "training.compile=true")
+ALONG_OTHERS = ("training.threads=1", "evaluation.workers=1")
 
 
 @dataclass(frozen=True, slots=True)
