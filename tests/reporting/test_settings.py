@@ -199,7 +199,7 @@ def test_figures_have_a_line_for_every_method_that_is_measured_in_another_world(
     row = replace(results[2].row, changes=(*results[2].row.changes, ("prefix", "guided")))
     guided = Result.of(replace(results[2].answer, row=row))
     labels = success_by_delay([*results, guided]).axes[1].get_legend_handles_labels()[1]
-    assert labels[-1] == f"{results[2].row.label}, guided prefix"
+    assert labels[-1] == f"{results[2].row.method}, guided prefix"
     severities = success_by_severity(results)
     assert severities.axes[0].get_title(loc="left") == "bump"
     assert len(severities.axes[0].containers) == 1
