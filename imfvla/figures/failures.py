@@ -70,7 +70,8 @@ def _bars(axes: Axes, stages: Sequence[str], results: Sequence[Result]) -> None:
                           color="white" if stage == 0 else INK)  # fmt: skip
         left += shares
     for place, end in zip(places, left, strict=True):
-        axes.text(end + 0.5, place, f"{round(end, 1):g}", va="center", fontsize=8, weight="bold")
+        axes.annotate(f"{round(end, 1):g}", (end, place), xytext=(4, 0), textcoords="offset points", va="center",
+                      fontsize=8, weight="bold")  # fmt: skip
     names = [result_name(result) for result in results]
     shown = [name if place == 0 or names[place - 1] != name else "" for place, name in enumerate(names)]
     blank = "\N{FIGURE SPACE}"  # as wide as a digit

@@ -53,12 +53,14 @@ def learning_curves(results: Sequence[Result]) -> Figure:
 def _panel(axes: Axes, title: str, curves: Curves) -> None:
     axes.set_title("\n".join(wrap(title, TITLE)), fontsize=9)
     axes.set_xlabel("training step")
-    axes.set_ylabel("loss, log axis")
-    axes.set_yscale("log")
+    is_log = all((loss > 0).all() for _, loss in curves.values())  # others have no place on a log axis
+    axes.set_ylabel("loss, log axis" if is_log else "loss")
+    axes.set_yscale("log" if is_log else "linear")
     for number, (label, (steps, loss)) in enumerate(curves.items()):
         axes.plot(steps, loss, label=label, linewidth=1.2, **look(number) | {"marker": ""})
     low, high = axes.get_ylim()
-    plain_log_ticks(axes.yaxis, (1, 2, 5) if high > WIDE * low else (1, 2, 3, 4, 5, 6, 8))
+    if is_log:
+        plain_log_ticks(axes.yaxis, (1, 2, 5) if high > WIDE * low else (1, 2, 3, 4, 5, 6, 8))
     if curves:
         axes.figure.legend(loc="outside lower left", fontsize=7.5, borderpad=0, labelspacing=0.3)
     else:

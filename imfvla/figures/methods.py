@@ -12,6 +12,8 @@ from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.results import Result
 
+SPREAD = 1.3  # of all methods at one number of calls, as a factor
+
 
 def success_by_cost(results: Sequence[Result]) -> Figure:
     """Success of a table's rows against NFE and against the median time of a chunk, a line for each method.
@@ -33,7 +35,8 @@ def success_by_cost(results: Sequence[Result]) -> Figure:
             return figure
         for number, method in enumerate(order):
             line = lines[method]
-            shift = 1.06 ** (number - (len(order) - 1) / 2)  # so that intervals do not hide each other
+            # so that intervals do not hide each other, and yet stand at their tick
+            shift = SPREAD ** ((number + 0.5) / len(order) - 0.5)
             _draw(left, line, [shift * r.nfe for r in line], number, method)
             _draw(right, line, [r.metrics["inference_ms_median"].value for r in line], number, method)
         nfe_ticks(left, (r.nfe for r in measured))

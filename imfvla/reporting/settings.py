@@ -60,6 +60,19 @@ def label(changes: Sequence[tuple[str, Any]]) -> str:
     return ", ".join(unusual({**USUAL, "delay_steps": None, **dict(changes)}))
 
 
+def short_labels(rows: Sequence[TableRow]) -> tuple[dict[str, str], str]:
+    """By the label of each row, its method and what not all rows have, such as "ACT (infer1)"; then what all have."""
+    parts = {row.label: row.setting.split(", ") for row in rows}
+    shared = [
+        part for part in next(iter(parts.values()), []) if all(part in of_row for of_row in parts.values())
+    ]
+    found = {}
+    for row in rows:
+        own = ", ".join(part for part in parts[row.label] if part not in shared)
+        found[row.label] = f"{row.method} ({own})" if own else row.method
+    return found, ", ".join(shared)
+
+
 def _settings(values: Mapping[str, Any], where: str) -> Iterator[tuple[tuple[str, Any], ...]]:
     """Every product of an entry's values, as what differs from the usual protocol."""
     for key in values:

@@ -9,7 +9,7 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import condition_happened
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, name_of
+from imfvla.reporting.settings import label, name_of, short_labels
 from imfvla.reporting.significance import holm
 from imfvla.reporting.table import MISSING, REFUSED, Table, interval
 from imfvla.reporting.tables import Document
@@ -54,7 +54,9 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
 def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     """Settings in lines and methods in columns for people; a line for each number for programs."""
     found = against_unchanged(table, results)
-    usual = {one.usual.name: one.usual for one in found}
+    told = {one.usual.name: one.usual for one in found}
+    usual = {name: told[name] for name in table.rows if name in told}
+    names, shared = short_labels([result.row for result in usual.values()])
     settings = list(dict.fromkeys(label(one.result.row.changes) for one in found))
     cells = {(label(one.result.row.changes), one.usual.name): one for one in found}
     rows = [(UNCHANGED, *(_usual_cell(result) for result in usual.values()))]
@@ -66,13 +68,17 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
         "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
         f"from the same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
         f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
-        *(_sentence(usual[name], [one for one in measured if one.usual.name == name]) for name in usual),
+        f"All methods: {shared}." if shared else "",
+        *(
+            _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
+            for name in usual
+        ),
         *_events([one.result for one in found]),
         *(f"{one.result.name}: refused, because {one.refused}." for one in found if one.refused),
     ]
     is_missing = any(one.result.is_missing or one.usual.is_missing for one in found)
     commands = ((table.name, f"python -m imfvla.train -m +sweep={table.sweep}"),) if is_missing else ()
-    columns = ("World", *(f"{result.row.method} ({result.row.setting})" for result in usual.values()))
+    columns = ("World", *(names[result.row.label] for result in usual.values()))
     notes = tuple(note for note in notes if note)
     shown = Table(table.title, columns, tuple(rows), notes, commands=commands, cell_keys=tuple(keys))
     data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
@@ -113,8 +119,8 @@ def _returned(result: Result) -> str:
     return f"{result.metric('avg_return').value:.0f}"
 
 
-def _sentence(usual: Result, measured: Sequence[Changed]) -> str:
-    """What was found of one row, whichever way it goes; nothing where it was not measured."""
+def _sentence(method: str, measured: Sequence[Changed]) -> str:
+    """What was found of one method, whichever way it goes; nothing where it was not measured."""
     if not measured:
         return ""
     worst = min(measured, key=lambda one: one.success.result.value)
@@ -130,7 +136,7 @@ def _sentence(usual: Result, measured: Sequence[Changed]) -> str:
         else f"no setting of {len(measured)} in which fewer successes are told from chance"
     )
     return (
-        f"{usual.row.label}: {told}; the lowest is {label(worst.result.row.changes)} with {percent.value:+.0f} points "
+        f"{method}: {told}; the lowest is {label(worst.result.row.changes)} with {percent.value:+.0f} points "
         f"{interval(percent, 0)}."
     )
 

@@ -7,6 +7,7 @@ import re
 import sys
 from dataclasses import dataclass
 from shutil import get_terminal_size
+from textwrap import wrap
 
 from rich.console import Console
 from rich.text import Text
@@ -24,6 +25,7 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.terminal import fit
 
 WIDE = 160  # characters a line where no terminal says how many it has
+HEAD = 20  # characters of a line in the name of a column in LaTeX
 NOTHING = "-"
 MISSING, REFUSED = "missing", "refused"
 FILL = "What is missing is filled by:"
@@ -78,7 +80,8 @@ class Table:
     def latex(self) -> str:
         """A floating table for the packages booktabs and graphicx, scaled to the width of the text."""
         columns = "".join("r" if self.is_numeric(name) else "l" for name in self.columns)
-        lines = [" & ".join(map(latex_cell, row)) + r" \\" for row in (self.columns, *self.rows)]
+        cells = (map(_latex_head, self.columns), *(map(latex_cell, row) for row in self.rows))
+        lines = [" & ".join(row) + r" \\" for row in cells]
         notes = [rf"\par\smallskip\footnotesize {latex_text(note)}" for note in self.notes]
         return "\n".join(
             (
@@ -115,6 +118,13 @@ class Table:
             console.print(Text(f"\n{FILL}"))
         for command in self.by_command():
             console.print(Text(visible(command)), soft_wrap=True)  # unbroken, so that it can be copied
+
+
+def _latex_head(name: str) -> str:
+    """The name of a column, a long one in several lines."""
+    lines = wrap(visible(name), HEAD, break_long_words=False, break_on_hyphens=False)
+    lines = [latex_cell(line) for line in lines]
+    return "".join(lines) if len(lines) < 2 else r"\shortstack[l]{" + r" \\ ".join(lines) + "}"
 
 
 def number(value: float | None, digits: int) -> str:

@@ -20,5 +20,10 @@ class RunLog(logging.FileHandler):
         if os.path.lexists(self.baseFilename):
             self._open().close()
 
+    def emit(self, record: logging.LogRecord) -> None:
+        """Writes a message. One that a launcher sends after its refused job has removed the folder has no place."""
+        if self.stream is not None or os.path.isdir(os.path.dirname(self.baseFilename)):
+            super().emit(record)
+
     def _open(self) -> TextIOWrapper:
         return open_to_append(Path(self.baseFilename))

@@ -9,6 +9,7 @@ import pytest
 
 from imfvla.command.entry import entry_point, output_directory
 from imfvla.errors import UserError
+from imfvla.storage.run_log import RunLog
 
 
 @pytest.fixture(autouse=True)
@@ -104,6 +105,17 @@ def test_a_refused_command_leaves_nothing(tmp_path):
     with pytest.raises(SystemExit):
         command(["name=x", "seed=1"])
     assert [path.name for path in tmp_path.rglob("*")] == ["runs", "x", "kept"]
+
+
+def test_a_message_after_a_refused_job_is_no_error(tmp_path):
+    """As Submitit's launcher sends one in the process of the job, whose folder is gone by then."""
+    log = RunLog(tmp_path / "gone" / "train.log")
+    log.handle(logging.makeLogRecord({"msg": "Job completed"}))
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "gone").mkdir()
+    log.handle(logging.makeLogRecord({"msg": "kept"}))
+    log.close()
+    assert (tmp_path / "gone" / "train.log").read_text() == "kept\n"
 
 
 def test_unknown_override_makes_no_directory(tmp_path):

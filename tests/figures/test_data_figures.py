@@ -162,6 +162,19 @@ def test_losses_in_different_units_share_no_panel(tmp_path):
     assert {"imf", "imf, seed 1"} <= set(texts(figure))
 
 
+@pytest.mark.parametrize(
+    ("last", "scale", "label"), [(0.1, "log", "loss, log axis"), (-0.1, "linear", "loss")]
+)
+def test_a_loss_that_ends_below_zero_has_a_linear_axis(tmp_path, last, scale, label):
+    run = make_run(tmp_path / "act" / "default", "act")
+    (run / "metrics.jsonl").write_text(f'{{"step": 100, "loss": 1.0}}\n{{"step": 600, "loss": {last}}}\n')
+    write_evaluation(run, 1, number=100)
+    figure = learning_curves([Result(evaluated) for evaluated in Sources([tmp_path]).others([])])
+    (axes,) = (axes for axes in figure.axes if axes.lines)
+    assert (axes.get_yscale(), axes.get_ylabel()) == (scale, label)
+    assert axes.lines[0].get_ydata().tolist() == [1.0, last]
+
+
 def test_a_learning_curve_without_its_cut_off_last_line(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 10, "loss": 2.0}\n{"step": 20, "loss": 1.0}\n{"step": 3')

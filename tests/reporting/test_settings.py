@@ -13,6 +13,7 @@ from synthetic_runs import answer_row
 
 from imfvla.command.planning import jobs_of_rows
 from imfvla.config.assets import folder
+from imfvla.config.protocol import MEASURED
 from imfvla.errors import UserError
 from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.reporting.answers import Sources
@@ -20,7 +21,7 @@ from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.media import Media
 from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, rows_of_settings
+from imfvla.reporting.settings import label, rows_of_settings, short_labels
 from imfvla.reporting.settings_table import settings_table
 
 MAPPING = read_mapping()
@@ -169,6 +170,25 @@ def answered_bump(root, happened):
     return Sources([root]).answer(row, MAPPING)
 
 
+def test_columns_name_what_tells_them_apart_and_what_all_have_is_said_once():
+    names, shared = short_labels([BY_NAME[name] for name in ("transfer_imf_infer1", "transfer_flow_infer2")])
+    assert list(names.values()) == ["iMF-AttnRes, two stages (infer1)", "Flow, high-noise times (infer2)"]
+    assert shared == "ph32, exec16"
+    assert short_labels([BY_NAME["transfer_l1"]]) == (
+        {BY_NAME["transfer_l1"].label: "L1 regression"}, "infer1, ph32, exec16"
+    )  # fmt: skip
+    assert short_labels([]) == ({}, "")
+
+
+def test_no_two_lines_of_a_figure_look_the_same(results):
+    """Of the rows of table 4 with a delay in ms, each with the results of one."""
+    late = [row for row in MAPPING.of_table("table4") if dict(row.changes).get("delay_ms") != MEASURED]
+    figure = success_by_delay([Result.of(replace(results[2].answer, row=row)) for row in late])
+    bars = {found.get_label(): found.lines[0] for axes in figure.axes for found in axes.containers}
+    looks = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in bars.values()}
+    assert len(looks) == len(bars) == len({(row.label, dict(row.changes).get("prefix")) for row in late})
+
+
 def test_what_is_not_measured_yet_is_said(tmp_path):
     sources = Sources([tmp_path])
     missing = [
@@ -199,7 +219,7 @@ def test_figures_have_a_line_for_every_method_that_is_measured_in_another_world(
     row = replace(results[2].row, changes=(*results[2].row.changes, ("prefix", "guided")))
     guided = Result.of(replace(results[2].answer, row=row))
     labels = success_by_delay([*results, guided]).axes[1].get_legend_handles_labels()[1]
-    assert labels[-1] == f"{results[2].row.label}, guided prefix"
+    assert labels[-1] == f"{results[2].row.method}, guided prefix"
     severities = success_by_severity(results)
     assert severities.axes[0].get_title(loc="left") == "bump"
     assert len(severities.axes[0].containers) == 1

@@ -41,6 +41,11 @@ def test_latex_has_as_many_cells_in_every_line_and_no_special_character_left():
     assert text.count(r"\begin") == text.count(r"\end")
 
 
+def test_a_long_name_of_a_column_is_broken_in_latex():
+    text = Table("Title", ("World", "Flow, high-noise times (infer2)"), (("unchanged", "90/100"),)).latex()
+    assert "World & \\shortstack[l]{Flow, high-noise \\\\ times (infer2)} \\\\\n" in text
+
+
 def test_text_has_the_commands_once():
     console = Console(record=True, width=100, file=io.StringIO())
     TABLE.print(console)
