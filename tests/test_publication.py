@@ -31,6 +31,8 @@ STEMS = (
     "table5",
     "aloha",
     "aloha_insertion",
+    "transfer_compared",
+    "needs",
     "others",
 )
 EXPECTED = Path(__file__).resolve().parent / "expected_tables"

@@ -14,7 +14,8 @@ def tool():
     return runpy.run_path(str(TOOL))
 
 
-def test_without_compiling_both_residuals_are_measured(tool, capsys):
+def test_without_compiling_both_residuals_are_measured(tool, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     tool["main"](["--only", "flow_high_noise", "--no-compile", "--rounds", "1"])
     eager, fixed = (line for line in capsys.readouterr().out.splitlines() if "flow_high_noise" in line)
     assert "1.00" in eager
