@@ -1,7 +1,7 @@
 """Whether a training runs compiled code (`nn/compiled.py`): true, false, or auto, where that saves time.
 
 auto runs the first steps as they are written and times them. If the rest would take more than `WORTH_S`, code is
-compiled from the next step on: that takes a minute or two once, and saves a quarter of a step. The state keeps the
+compiled from the next step on: that takes two minutes once, and saves a quarter of a step. The state keeps the
 decision, so that a resumed run equals an uninterrupted one.
 """
 
@@ -22,7 +22,7 @@ from imfvla.training.sharding import NONE
 AUTO = "auto"
 EAGER, COMPILED = MODES = ("eager", "compiled")
 DECIDED_AT = 20  # steps
-WORTH_S = 360.0  # a fifth to a third less is then more than compiling takes
+WORTH_S = 480.0  # a quarter of it is what compiling without earlier code takes
 log = logging.getLogger(__name__)
 
 
