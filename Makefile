@@ -62,10 +62,10 @@ bench: setup  ## Measure sizes, simulation, rendering, training and latency on t
 	$(PY) -m imfvla.bench $(ARGS)
 
 tables: setup  ## Make the paper's tables and figures and a page from the run directories
-	$(PY) -m imfvla.report $(ARGS)
+	OMP_NUM_THREADS=1 $(PY) -m imfvla.report $(ARGS)
 
 report: setup  ## Make them in experiments/report, with videos and recordings: a folder to send or serve
-	$(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
+	OMP_NUM_THREADS=1 $(PY) -m imfvla.report output=experiments/report media=true $(ARGS)
 
 gallery: setup  ## Write pictures of every view of the tasks, and of every condition of an evaluation
 	for task in socket transfer either_arm gate; do $(PY) -m imfvla.gallery task=$$task $(ARGS); done
