@@ -11,17 +11,12 @@ from matplotlib.figure import Figure
 from imfvla.figures.names import result_name
 from imfvla.figures.panels import panels_of, say_nothing_yet, stages_of
 from imfvla.figures.style import INK, VERMILION, WIDTH, new_figure, style
-from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
+from imfvla.reporting.rows import first_failed_stage
 
 SHADES = LinearSegmentedColormap.from_list("failures", [VERMILION, "#fbe3d0"])
 BAR, FRAME = 0.19, 1.25  # inches: of a bar with its gap, of what is above and below the bars of a panel
 LEAST = 4  # percent that a number within a bar needs
-
-
-def first_failed_stage(row: Row) -> int | None:
-    """The index of the first stage that never held, None where all of them did."""
-    return next((index for index, step in enumerate(row["first_step_of_stage"]) if step < 0), None)
 
 
 def failed_stages(results: Sequence[Result]) -> Figure:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from imfvla.figures.panels import look, nfe_ticks, plain_log_ticks, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
-from imfvla.reporting.curves import learning_curve
+from imfvla.reporting.curves import training_minutes
 from imfvla.reporting.results import Result
 
 SPREAD = 1.3  # of all methods at one number of calls, as a factor
@@ -58,7 +58,6 @@ def _draw(axes: Axes, line: Sequence[Result], x: Sequence[float], number: int, m
 def _training(line: Sequence[Result]) -> str:
     """Number and mean time of a method's trainings, such as "3 trainings of 12 min"."""
     runs = {found.evaluation.run for result in line for found in result.evaluated}
-    spent = [learning_curve(run, "train_s")[1] for run in runs]
-    minutes = [seconds[-1] / 60 for seconds in spent if len(seconds)]
+    minutes = training_minutes(runs)
     count = "1 training" if len(runs) == 1 else f"{len(runs)} trainings"
-    return f"{count} of {sum(minutes) / len(minutes):.0f} min" if minutes else count
+    return count if minutes is None else f"{count} of {minutes:.0f} min"

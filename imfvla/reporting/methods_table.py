@@ -1,11 +1,10 @@
 """A table of methods: what each reaches on every task, how long a chunk takes, and how long its training took."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 
 from imfvla.reporting.cells import BY_NAME
-from imfvla.reporting.curves import learning_curve
+from imfvla.reporting.curves import training_minutes
 from imfvla.reporting.mapping_methods import MethodEntry
 from imfvla.reporting.mapping_tables import TableTitle
 from imfvla.reporting.results import Result
@@ -33,7 +32,7 @@ def methods_table(
         found = {row.table: named[row.name] for row in entry.rows}
         measured = [result for result in found.values() if not result.is_missing]
         ms = median(_chunk_times(measured)) if measured else None
-        minutes = _training_minutes(measured)
+        minutes = training_minutes({one.evaluation.run for result in measured for one in result.evaluated})
         successes = [_success(found.get(place.name)) for place in places]
         rows.append((entry.method, *successes, number(ms, 1), number(minutes, 1)))
         data += [_data(entry, place, found[place.name], minutes) for place in places if place.name in found]
@@ -79,13 +78,3 @@ def _data(entry: MethodEntry, place: TableTitle, result: Result, minutes: float 
 def _chunk_times(results: Sequence[Result]) -> list[float]:
     """A median for each policy [ms]."""
     return [LATENCY.of(found.episodes) for result in results for found in result.evaluated]
-
-
-def _training_minutes(results: Sequence[Result]) -> float | None:
-    """Mean over the policies that say it; of a run that went on after a stop, all its parts count."""
-    runs: dict[Path, None] = dict.fromkeys(
-        found.evaluation.run for result in results for found in result.evaluated
-    )
-    spent = [learning_curve(run, "train_s")[1] for run in runs]
-    minutes = [seconds[-1] / 60 for seconds in spent if len(seconds)]
-    return fmean(minutes) if minutes else None

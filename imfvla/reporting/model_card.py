@@ -11,6 +11,7 @@ from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.cells import BY_NAME, with_its_interval
 from imfvla.reporting.escaping import markdown_cell, markdown_text
 from imfvla.reporting.results import Result
+from imfvla.reporting.rows import first_failed_stage
 from imfvla.reporting.runs import Evaluation, evaluations
 from imfvla.reporting.table import Table, number
 from imfvla.storage.records import WeightsDescription, read_record
@@ -123,10 +124,8 @@ def _failures(usual: Sequence[Evaluation]) -> str:
     failed = [row for row in rows if not row["success"]]
     if not stages or not failed:
         return ""
-    firsts = (
-        next((i for i, step in enumerate(row["first_step_of_stage"]) if step < 0), None) for row in failed
-    )
-    counts = Counter(first for first in firsts if first is not None)
+    counts = Counter(first_failed_stage(row) for row in failed)
+    del counts[None]  # all stages held, but not to the end
     told = ", ".join(f"{stages[stage]} {count}" for stage, count in sorted(counts.items()))
     return (
         f"Of {len(rows)} episodes {len(failed)} failed, by the first stage that they did not reach: {told}."

@@ -1,4 +1,4 @@
-"""The line of `episodes.jsonl` that an episode becomes."""
+"""The line of `episodes.jsonl` that an episode becomes, and what is read from it."""
 
 from typing import Any
 
@@ -32,3 +32,8 @@ def row_of(result: EpisodeResult) -> Row:
 def untimed(row: Row) -> dict[str, Any]:
     """The row without its times: equal for equal runs."""
     return {key: value for key, value in row.items() if key != TIMING}
+
+
+def first_failed_stage(row: Row) -> int | None:
+    """The index of the first stage that never held, None where all of them did."""
+    return next((index for index, step in enumerate(row["first_step_of_stage"]) if step < 0), None)

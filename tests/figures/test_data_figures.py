@@ -11,7 +11,7 @@ from imfvla.errors import UserError
 from imfvla.figures.ablations import ablations
 from imfvla.figures.depth_attention import FILE, depth_attention, read_depth_attention
 from imfvla.figures.evaluations import success_by_evaluations
-from imfvla.figures.failures import failed_stages, first_failed_stage
+from imfvla.figures.failures import failed_stages
 from imfvla.figures.learning import learning_curves
 from imfvla.figures.methods import success_by_cost
 from imfvla.figures.panels import panels_of
@@ -21,6 +21,7 @@ from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.measured import Measured
 from imfvla.reporting.results import Result
+from imfvla.reporting.rows import first_failed_stage
 
 MAPPING = read_mapping()
 MISSING = ("socket_smolvla", "transfer_dit_ph08_exec08", "socket_l1")
