@@ -5,7 +5,7 @@ python tools/step_ratios.py --only "imf, first stage" --compile --cold
 
 Steps are taken in turn, in one process with one thread, on a made-up batch of the experiment's size in the precision
 that `training.precision=auto` takes here; the ratio is of the fastest ones. Compiling is timed where it happens: in
-this process (tracing, one core) and in its children (the C++ compiler, all cores). `--cold` compiles everything anew,
+this process (tracing, one core) and in its children (the C++ compiler, all cores). `--cold` compiles everything again,
 in a directory of its own.
 """
 

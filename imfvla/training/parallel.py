@@ -110,7 +110,7 @@ class Shared(Alone):
         if options.compile is True and options.sharding != NONE:
             raise UserError(
                 f"training.compile must be auto or false with training.sharding={options.sharding}, found true: "
-                "PyTorch compiles code anew for weights that are gathered in each step."
+                "PyTorch compiles code again for weights that are gathered in each step."
             )
 
     def mean(self, values: Sequence[float]) -> list[float]:
