@@ -34,10 +34,11 @@ from imfvla.training.origin import Origin
 from imfvla.training.parallel import Alone
 from imfvla.training.precision import PRECISIONS, allow_tf32, choose_precision
 from imfvla.training.schedule import learning_rate
-from imfvla.training.sharding import FULL, release, shard, whole
+from imfvla.training.sharding import FULL, shard, whole
 from imfvla.training.spans import Span, Spans
 from imfvla.training.train_state import TrainState, load_state, save_state
 from imfvla.training.transfer import Sent, Transfer
+from imfvla.training.unread import Unread
 from imfvla.types import Batch
 
 LOSS_STREAM = 1  # of the random numbers that a policy's loss draws
@@ -56,6 +57,7 @@ class Batches(Protocol):
     """Endless batches with a state, such as `imfvla.data.Loader`."""
 
     def __next__(self) -> Batch | Sent: ...
+    def batch(self, number: int) -> Batch: ...  # once more
     def describe(self, number: int) -> list[str]: ...  # episode and step of each row of batch `number`
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
@@ -100,23 +102,26 @@ class Trainer:
         self.step = self.saved_step = 0
         self.train_s = 0.0  # spent in this process and earlier ones
         self._logger_state: dict[str, Any] | None = None
-        self.clipping = Clipping(optim.clip_factor, optim.clip_norm)
+        self.unread = Unread()
         self.origin = Origin(self.description.get("config"))
         precision: str | None = None
         compiling: str | None = None
+        gradient_scale: float | None = None
         if run.last_state.exists():
             details = load_state(run.last_state, self.state)
             self.origin.resume(details, run.last_state)
             self.step = self.saved_step = details["step"]
             self.train_s, self._logger_state = details["train_s"], details["logger"]
-            precision, self.clipping.scale = details["precision"], details["gradient_scale"]
+            precision, gradient_scale = details["precision"], details["gradient_scale"]
             compiling = details.get("compiling", EAGER)  # states without it are older than auto
             batches.load_state_dict(details["batches"])
             log.info(f"resuming at step {self.step} of {options.steps} from {run.last_state}")
         precision = precision or choose_precision(options.precision, self.device)
         self.precision = self.processes.first_of(PRECISIONS, precision)
         allow_tf32(self.precision)
+        self.clipping = Clipping(optim.clip_factor, optim.clip_norm, gradient_scale, self.device)
         self.non_finite = NonFinite(options.on_non_finite)
+        self._goes_on = torch.ones((), dtype=torch.bool, device=self.device)
         self.compiling = Compiling(options, self.policy, self.device, self.processes, compiling)
 
     @property
@@ -151,23 +156,22 @@ class Trainer:
         keep_weights = self.options.checkpoint_steps()
         start = interval_start = last_save = time.perf_counter()
         spent_before, first_step, interval_step, waited = self.train_s, self.step, self.step, 0.0
+        loss = math.nan  # as last read
         while not self.is_finished:
             before = time.perf_counter()
             batch = next(self.batches)
             received = time.perf_counter()
             waited += received - before
-            scalars = self._update(batch)
+            self._update(batch)
             self.compiling.took(time.perf_counter() - received, self.step)
-            if scalars is None:
-                logger.skip()
-                scalars = {"loss": math.nan}
-            else:
-                logger.add(scalars)
+            row_is_due = self.step % self.options.log_every == 0 or self.is_finished
+            if row_is_due:
+                loss = self._read(logger)
             now = time.perf_counter()
             self.train_s = spent_before + now - start
             rate = (self.step - first_step) / (now - start)
-            progress.advance(f"loss {scalars['loss']:.4f}  {rate:.2f} steps/s")
-            if self.step % self.options.log_every == 0 or self.is_finished:
+            progress.advance(f"loss {loss:.4f}  {rate:.2f} steps/s")
+            if row_is_due:
                 seconds = now - interval_start
                 rate = (self.step - interval_step) / seconds
                 logger.write(
@@ -187,8 +191,8 @@ class Trainer:
                 )
                 raise Stopped(stop)
 
-    def _update(self, batch: Batch | Sent) -> dict[str, float] | None:
-        """One step of the optimiser over all processes; returns what to log, None where the batch is skipped."""
+    def _update(self, batch: Batch | Sent) -> None:
+        """One step of the optimiser over all processes; none where loss or gradient is not finite."""
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate(group["span"])
         self.ema.settle(self.step)
@@ -205,26 +209,39 @@ class Trainer:
             processes=self.processes,
         )
         self.processes.average_gradients(self.policy.parameters())
-        limit = self.clipping.limit
-        norm = whole(nn.utils.clip_grad_norm_(self.policy.parameters(), limit))
-        *values, norm = numbers(loss, *logs.values(), norm)
-        loss_value, *means = self.processes.mean(values)
-        if not math.isfinite(loss_value):
-            return self._skip("loss", loss_value, batch)
-        if not math.isfinite(norm):
-            return self._skip("norm of the gradient", norm, batch)
-        clipped = self.clipping.update(norm)
+        gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
+        norm = whole(nn.utils.get_total_norm(gradients))
+        exact = torch.stack([scalar.detach().to(torch.float64) for scalar in (loss, *logs.values())])
+        loss, *means = self.processes.mean(exact)
+        takes_part = self._goes_on & loss.isfinite() & norm.isfinite()
+        if self.non_finite.stops:
+            self._goes_on = takes_part  # the weights stay those that such a batch was found with
+        clipped = self.clipping.clip(gradients, norm, takes_part)
+        self.optimiser.found_inf = (~takes_part).to(torch.float32)  # decides on the device whether it steps
         self.optimiser.step()
         self.ema.update(self.step)
+        rate = max(group["lr"] for group in self.optimiser.param_groups)
+        measured = {"loss": loss, "grad_norm": norm, "clipped": clipped, "lr": rate}
+        self.unread.add(self.step, measured | dict(zip(logs, means, strict=True)))
         self.step += 1
-        self.non_finite.in_a_row = 0
-        measured = {
-            "loss": loss_value,
-            "grad_norm": norm,
-            "clipped": clipped,
-            "lr": max(group["lr"] for group in self.optimiser.param_groups),
-        }
-        return measured | dict(zip(logs, means, strict=True))
+
+    def _read(self, logger: MetricsLogger) -> float:
+        """Logs what the steps since the last reading measured; returns the last loss.
+
+        Nothing else waits for a GPU. Raises UserError where a batch that is not finite is to stop the training.
+        """
+        loss = math.nan
+        for step, scalars in self.unread.read():
+            loss = scalars["loss"]
+            for what, name in (("loss", "loss"), ("norm of the gradient", "grad_norm")):
+                if not math.isfinite(scalars[name]):
+                    self._skipped(step, what, scalars[name])
+                    logger.skip()
+                    break
+            else:
+                self.non_finite.in_a_row = 0
+                logger.add(scalars)
+        return loss
 
     def _rate(self, span: Span) -> float:
         """The learning rate of this step for parameters that learn in the steps of `span`; 0 in others."""
@@ -239,21 +256,15 @@ class Trainer:
             floor=self.optim.floor,
         )
 
-    def _skip(self, what: str, value: float, batch: Batch | Sent) -> None:
-        """Leaves the weights as they are. Raises UserError where training is to stop."""
-        release(self.policy)
-        cause = name_cause(
-            self.policy,
-            self.transfer.whole(batch),
-            step_seed(self.seed, self.step),
-            self.batches.describe(self.step),
-        )
+    def _skipped(self, step: int, what: str, value: float) -> None:
+        """Says what step `step` did not learn from. Raises UserError where training is to stop."""
+        self.policy.begin_step(step, self.options.steps)
+        batch = self.batches.batch(step).to(self.device)
+        cause = name_cause(self.policy, batch, step_seed(self.seed, step), self.batches.describe(step))
         kept = (
             f"the state of step {self.saved_step} is kept" if self.saved_step else "no state was saved before"
         )
-        self.non_finite.found(what, value, self.step, cause, f"{kept} in {self.run.path}")
-        self.optimiser.zero_grad(set_to_none=True)
-        self.step += 1
+        self.non_finite.found(what, value, step, cause, f"{kept} in {self.run.path}")
 
     def _save_weights(self) -> None:
         description = {
@@ -268,6 +279,7 @@ class Trainer:
         save_weights(directory, self.ema.policy, description, writes=self.processes.is_first)
 
     def _save_state(self, logger: MetricsLogger) -> None:
+        self._read(logger)
         logger.sync()  # rows up to this step must outlive it
         self.saved_step = self.step
         details = {
@@ -275,17 +287,12 @@ class Trainer:
             "train_s": self.train_s,
             "precision": self.precision,
             "compiling": self.compiling.mode,
-            "gradient_scale": self.clipping.scale,
+            "gradient_scale": self.clipping.state(),
             "batches": self.batches.state_dict(),
             "logger": logger.state(),
             **self.origin.to_json(),
         }
         save_state(self.run.last_state, self.state, details, writes=self.processes.is_first)
-
-
-def numbers(*scalars: Tensor) -> list[float]:
-    """Scalars of one device as floats, read at once: an accelerator is waited for a single time in a step."""
-    return torch.stack([scalar.detach().to(torch.float64) for scalar in scalars]).tolist()
 
 
 def step_seed(seed: int, step: int) -> int:

@@ -26,6 +26,11 @@ class NonFinite:
     wanted: str
     in_a_row: int = 0
 
+    @property
+    def stops(self) -> bool:
+        """Whether the first such batch is to stop the training."""
+        return self.wanted == STOP
+
     def found(self, what: str, value: float, step: int, cause: str, kept: str) -> None:
         """Logs it and returns if the batch is to be skipped. Raises UserError if training is to stop."""
         self.in_a_row += 1

@@ -1,4 +1,4 @@
-"""Data-parallel training: `torchrun --nproc-per-node=N -m imfvla.train ...`, gloo on CPUs and nccl on GPUs.
+"""Data-parallel training: `torchrun --nproc-per-node=N -m imfvla.train ...`, gloo on CPUs and nccl between GPUs.
 
 N processes compute what one computes, each on its share of the rows of every batch:
 
@@ -79,9 +79,9 @@ class Alone:
                 "torchrun --nproc-per-node=2 -m imfvla.train ..., or set training.sharding=none."
             )
 
-    def mean(self, values: Sequence[float]) -> list[float]:
-        """The mean of each value over the processes."""
-        return list(values)
+    def mean(self, values: Tensor) -> Tensor:
+        """The mean of each value over the processes, on the values' device."""
+        return values
 
     def highest(self, values: Sequence[int]) -> list[int]:
         """The highest of each value over the processes."""
@@ -113,13 +113,13 @@ class Shared(Alone):
                 "PyTorch compiles code again for weights that are gathered in each step."
             )
 
-    def mean(self, values: Sequence[float]) -> list[float]:
-        total = torch.tensor(values, dtype=torch.float64, device=_device())
+    def mean(self, values: Tensor) -> Tensor:
+        total = values.clone()
         dist.all_reduce(total)
-        return (total / self.size).tolist()
+        return total / self.size
 
     def highest(self, values: Sequence[int]) -> list[int]:
-        found = torch.tensor(values, dtype=torch.int64, device=_device())
+        found = torch.tensor(values, dtype=torch.int64)
         dist.all_reduce(found, dist.ReduceOp.MAX)
         return found.tolist()
 
@@ -139,7 +139,7 @@ class Shared(Alone):
             tensor.copy_(whole)
 
     def first_of(self, values: Sequence[str], mine: str) -> str:
-        chosen = torch.tensor([values.index(mine)], device=_device())
+        chosen = torch.tensor([values.index(mine)])
         dist.broadcast(chosen, 0)
         return values[int(chosen)]
 
@@ -167,7 +167,8 @@ def joined_processes(device: str) -> Iterator[Alone]:
     # gloo's threads sometimes abort. At its import, which the first optimiser triggers, the functions of this module
     # take the current group as a default: imported here, before there is a group, they hold none.
     importlib.import_module("torch.distributed.nn.functional")
-    backend = "nccl" if on_gpu else "gloo"
+    # Tensors of a GPU go by nccl, which the host does not wait for, and the host's own small messages by gloo.
+    backend = "cpu:gloo,cuda:nccl" if on_gpu else "gloo"
     dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=TIMEOUT)
     try:
         yield Shared(rank, size, local_size)
@@ -251,7 +252,3 @@ def _buckets(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
     if bucket:
         yield bucket
 
-
-def _device() -> torch.device:
-    """The device of small messages: nccl sends only from GPUs."""
-    return torch.device("cuda" if dist.get_backend() == "nccl" else "cpu")

@@ -60,6 +60,11 @@ def whole(tensor: Tensor) -> Tensor:
     return tensor.full_tensor() if is_part(tensor) else tensor
 
 
+def own_part(tensor: Tensor) -> Tensor:
+    """What this process holds of a tensor: a view."""
+    return tensor.to_local() if is_part(tensor) else tensor
+
+
 def gathered(tensors: Mapping[str, Tensor], *, keep: bool) -> dict[str, Tensor]:
     """Whole tensors on the CPU, one after the other; none where a process only contributes its shards."""
     found = {}

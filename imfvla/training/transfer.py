@@ -65,7 +65,6 @@ class Cuda:
 class Sent:
     """A batch under way."""
 
-    whole: tuple[Batch, Changes | None]  # all rows, where they were prepared
     share: Batch  # this process's rows, on the device as soon as `event` has come
     changes: Changes | None  # of their pictures
     event: Any
@@ -85,17 +84,17 @@ class Transfer:
 
     def send(self, batch: Batch, changes: Changes | None = None) -> Sent:
         """Begins the copy of this process's rows."""
-        whole, share = (batch, changes), self._processes.share(batch)
+        share = self._processes.share(batch)
         if changes is not None:
             changes = changes.map(self._processes.share_of)
         if self._streams is None:
-            return Sent(whole, _map(self._moved, share), changes, None)
+            return Sent(_map(self._moved, share), changes, None)
         pinned = _map(self._streams.pin, share)
         changes = None if changes is None else changes.map(self._streams.pin)
         with self._streams.aside():
             moved = _map(self._moved, pinned)
             changes = None if changes is None else changes.map(self._moved)
-        return Sent(whole, moved, changes, self._streams.mark())
+        return Sent(moved, changes, self._streams.mark())
 
     def receive(self, found: Batch | Sent) -> Batch:
         """The rows, for work that the current stream is given from now on."""
@@ -106,10 +105,6 @@ class Transfer:
             if sent.changes is not None:
                 sent.changes.map(self._kept)
         return changed(sent.share, sent.changes)
-
-    def whole(self, found: Batch | Sent) -> Batch:
-        """All rows of a batch on the device, those of other processes too."""
-        return (changed(*found.whole) if isinstance(found, Sent) else found).to(self._device)
 
     def _moved(self, tensor: Tensor) -> Tensor:
         return tensor.to(self._device, non_blocking=True)

@@ -52,7 +52,10 @@ class FaultyBatches(CountedBatches):
         number = self.next_batch
         if self.is_last_process and number == self.job.stops_before:
             os.kill(os.getpid(), signal.SIGTERM)  # one is asked, all stop after the same step
-        batch = super().__next__()
+        return super().__next__()
+
+    def batch(self, number: int) -> Any:
+        batch = super().batch(number)
         if number == self.job.nan_in:
             batch.actions[5] = torch.nan
         return batch

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from contextlib import nullcontext
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -280,9 +281,9 @@ def test_stops_where_loss_or_gradient_is_not_finite(tmp_path, make_trainer, wher
 
 def test_what_is_not_finite_is_traced_to_its_row(tmp_path, make_trainer):
     class OneBadRow(CountedBatches):
-        def __next__(self):
-            batch = super().__next__()
-            if self.next_batch == 3:
+        def batch(self, number):
+            batch = super().batch(number)
+            if number == 2:
                 batch.actions[5, 0, 0] = torch.inf
             return batch
 
@@ -390,16 +391,29 @@ def test_cuda_without_a_device_is_refused(monkeypatch):
 READS = ("item", "tolist", "cpu", "numpy", "__bool__", "__float__", "__int__", "nonzero")
 
 
-def test_a_step_waits_once_for_an_accelerator(tmp_path, make_trainer, monkeypatch):
-    """On a CPU every read of a tensor's values counts, since on a GPU each of them would wait."""
-    trainer = make_trainer(tmp_path)
-    read = []
+@pytest.fixture
+def reads(monkeypatch) -> list[str]:
+    """Every read of a tensor's values on a CPU, since on a GPU each of them would wait."""
+    found = []
     for name in READS:
         was = getattr(torch.Tensor, name)
         monkeypatch.setattr(
-            torch.Tensor, name, lambda *args, was=was, name=name: read.append(name) or was(*args)
+            torch.Tensor, name, lambda *args, was=was, name=name: found.append(name) or was(*args)
         )
-    batch = next(trainer.batches)
-    read.clear()
-    trainer._update(batch)
-    assert read == ["tolist"]
+    return found
+
+
+def test_nothing_waits_for_an_accelerator_between_two_rows_of_the_log(tmp_path, make_trainer, reads):
+    class Batches(CountedBatches):
+        def __next__(self):
+            batch = super().__next__()
+            at_step.append(len(reads))
+            return batch
+
+    at_step = []
+    trainer = make_trainer(tmp_path, steps=10, log_every=5, checkpoints=1, save_every_s=1e9)
+    trainer.batches = Batches()
+    trainer.train()
+    since = [after - before for before, after in pairwise([*at_step, len(reads)])]
+    assert [count > 0 for count in since] == [False, False, False, False, True] * 2
+    assert since[4] == 1

@@ -63,8 +63,6 @@ def test_a_process_gets_its_rows_with_their_changes(streams, size):
         assert torch.equal(received.obs.images, expected[mine])
         for own, whole in zip(tensors(received)[1:], tensors(batch)[1:], strict=True):
             assert torch.equal(own, whole[mine])
-        assert torch.equal(transfer.whole(sent).obs.images, expected)
-        assert torch.equal(transfer.whole(batch).obs.images, batch.obs.images)
 
 
 def test_a_copy_is_made_aside_from_pinned_memory_and_waited_for_by_the_stream():

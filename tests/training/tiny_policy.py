@@ -74,8 +74,12 @@ class CountedBatches:
         self.closed = False
 
     def __next__(self) -> Batch:
-        rng = np.random.default_rng(self.next_batch)
+        batch = self.batch(self.next_batch)
         self.next_batch += 1
+        return batch
+
+    def batch(self, number: int) -> Batch:
+        rng = np.random.default_rng(number)
         obs = Observation(
             images=torch.zeros(8, 1, 1, 3, 2, 2, dtype=torch.uint8),
             state=torch.from_numpy(rng.normal(size=(8, 1, STATE)).astype(np.float32)),
