@@ -3,8 +3,8 @@
 tools/gpu_check.sh                                  # under 8 minutes
 tools/gpu_check.sh --device cpu --quick             # the same on a CPU, with small networks and few calls
 
-- training: steps/s of the headline policy, with the plain form and both stages of the other, in each precision, and
-  the peak of the GPU's memory. Batches are random and come from the host.
+- training: steps/s of the headline policy, with the plain form and both stages of the other, in each precision, and in
+  bf16 with the loss compiled as one graph; and the peak of the GPU's memory. Batches are random and come from the host.
 - latency: median and 95th percentile of a chunk at batch 1, numpy to numpy, for the policies of Table 3's rows.
 - equality: losses of the same few training steps on the device and on the CPU, in fp32 with the same random numbers.
 - derivative: error of Mean Flow's Jacobian-vector product in fp32 and TF32 against float64, of a shipped policy.
@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from imfvla.benchmarks.latency import LOG_MEDIAN
 from imfvla.benchmarks.rounding import derivative_errors
 from imfvla.benchmarks.tables import SAME_STEP, SPEEDS, speed_ratios, speed_table
 from imfvla.command.composition import compose
@@ -135,10 +136,17 @@ def fitted(config: Mapping[str, Any]) -> Policy:
 
 
 def trainer_of(
-    config: Mapping[str, Any], batch: int, device: torch.device, precision: str, scratch: str
+    config: Mapping[str, Any],
+    batch: int,
+    device: torch.device,
+    precision: str,
+    scratch: str,
+    compile: bool = False,
 ) -> Trainer:
     read, policy = read_experiment(config), fitted(config)
-    options = replace(read.training, device=device.type, precision=precision, batch_size=batch)
+    options = replace(
+        read.training, device=device.type, precision=precision, batch_size=batch, compile=compile
+    )
     batches = RandomBatches(policy, batch)
     return Trainer(policy, batches, RunDirectory(scratch), options, read.optim, seed=0, description={})
 
@@ -146,30 +154,38 @@ def trainer_of(
 def measure_training(effort: Effort, device: torch.device) -> dict[str, dict[str, float]]:
     """Steps/s and MiB by form and precision."""
     found = {}
-    precisions = [one for one in PRECISIONS if one != TF32 or device.type == "cuda"]
-    with Progress("training", len(STAGES) * len(precisions)) as bar, tempfile.TemporaryDirectory() as scratch:
+    on_gpu = device.type == "cuda"
+    arms = [(one, False) for one in PRECISIONS if one != TF32 or on_gpu] + [("bf16", True)] * on_gpu
+    with Progress("training", len(STAGES) * len(arms)) as bar, tempfile.TemporaryDirectory() as scratch:
         for form, begins in STAGES.items():
             config = composed(effort, f"+exp={HEADLINE}", f"generator={form.split(',')[0]}")
-            for precision in precisions:
-                trainer = trainer_of(config, effort.batch, device, precision, f"{scratch}/{form}-{precision}")
+            for precision, compiled in arms:
+                arm = f"{form}, {precision}{', compiled' * compiled}"
+                trainer = trainer_of(
+                    config, effort.batch, device, precision, f"{scratch}/{arm}", compile=compiled
+                )
                 trainer.policy.train()
                 trainer.step = int(begins * trainer.options.steps)
-                if device.type == "cuda":
+                if on_gpu:
                     torch.cuda.reset_peak_memory_stats()
-                for _ in range(1 + effort.steps // 5):
-                    trainer._update(next(trainer.batches))
+                run_steps(trainer, 1 + effort.steps // 5)
                 began = time.perf_counter()
-                for _ in range(effort.steps):
-                    trainer._update(next(trainer.batches))  # reads the loss, and so waits for the device
+                run_steps(trainer, effort.steps)
                 seconds = time.perf_counter() - began
-                memory = torch.cuda.max_memory_allocated() / MIB if device.type == "cuda" else 0.0
-                found[f"{form}, {precision}"] = {
+                memory = torch.cuda.max_memory_allocated() / MIB if on_gpu else 0.0
+                found[arm] = {
                     "steps_per_s": effort.steps / seconds,
                     "step_ms": 1e3 * seconds / effort.steps,
                     "peak_mib": memory,
                 }
-                bar.advance(f"{form} in {precision}")
+                bar.advance(arm)
     return found
+
+
+def run_steps(trainer: Trainer, steps: int) -> None:
+    for _ in range(steps):
+        trainer._update(next(trainer.batches))
+    list(trainer.unread.read())  # waits for the device
 
 
 def measure_latency(effort: Effort, device: torch.device) -> dict[str, dict[str, dict[str, float]]]:
@@ -195,7 +211,7 @@ def measure_latency(effort: Effort, device: torch.device) -> dict[str, dict[str,
                 found.setdefault(name, {})[f"infer{nfe}"] = {
                     "median_ms": float(np.median(times)),
                     "p95_ms": float(np.percentile(times, 95)),
-                    "log_error": bootstrap(_log_median, times).error or 0.0,
+                    "log_error": bootstrap(LOG_MEDIAN, times).error or 0.0,
                 }
             bar.advance(name)
     return found
@@ -238,10 +254,6 @@ def measure_derivative(effort: Effort, device: torch.device) -> dict[str, dict[s
     run = RunDirectory(SHIPPED)
     policy = load_policy(run, run.weights_step()).to(device).eval()
     return derivative_errors(policy, RandomBatches(policy, effort.rows).batch.obs)
-
-
-def _log_median(times: np.ndarray, axis: int) -> np.ndarray:
-    return np.log(np.median(times, axis=axis))
 
 
 def tables_of(found: Mapping[str, Any], effort: Effort) -> list[Table]:

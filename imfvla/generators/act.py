@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.generators.base import masked_mean, refuse_nfe
 from imfvla.options import above, at_least
 
@@ -35,7 +36,7 @@ class ActionChunking:
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,)."""
         mean, log_variance = (part.to(actions) for part in core.style(context, actions, valid))
-        noise = torch.randn(mean.shape, generator=rng, device=rng.device).to(mean)
+        noise = draw(torch.randn, mean.shape, rng=rng).to(mean)
         chunk = core(context, mean + (0.5 * log_variance).exp() * noise)
         error = masked_mean((chunk - actions).abs(), valid)
         divergence = divergence_from_standard_normal(mean, log_variance)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.errors import UserError
 from imfvla.options import above, at_least, within
 
@@ -44,7 +45,7 @@ class Generator(Protocol):
         """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars without gradient to log.
 
         `rng` is a generator of the actions' device, or of the CPU: draw where it is, then move, as in
-        `torch.randn(x.shape, generator=rng, device=rng.device).to(x)`. Of several draws (B * N, H, A) those of an
+        `draw(torch.randn, x.shape, rng=rng).to(x)`. Of several draws (B * N, H, A) those of an
         observation lie side by side, and the loss is their mean. A loss reads no number of a tensor, such as by
         `.item()`, and makes none of Python's numbers: a GPU would be waited for.
         """
@@ -99,7 +100,7 @@ class UniformTimes:
     """t ~ U[0, 1]."""
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return torch.rand(count, generator=rng, device=rng.device)
+        return draw(torch.rand, count, rng=rng)
 
 
 class BetaTimes:
@@ -109,7 +110,7 @@ class BetaTimes:
         self.alpha, self.span = alpha, span
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return 1 - self.span * (1 - torch.rand(count, generator=rng, device=rng.device) ** (1 / self.alpha))
+        return 1 - self.span * (1 - draw(torch.rand, count, rng=rng) ** (1 / self.alpha))
 
 
 class LogitNormalTimes:
@@ -119,7 +120,7 @@ class LogitNormalTimes:
         self.mean, self.std = mean, std
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return torch.sigmoid(self.mean + self.std * torch.randn(count, generator=rng, device=rng.device))
+        return torch.sigmoid(self.mean + self.std * draw(torch.randn, count, rng=rng))
 
 
 class HighNoiseTimes:
@@ -134,7 +135,7 @@ class HighNoiseTimes:
         self.span, self.power = span, power
 
     def __call__(self, count: int, rng: torch.Generator) -> Tensor:
-        return 1 - self.span * torch.rand(count, generator=rng, device=rng.device) ** self.power
+        return 1 - self.span * draw(torch.rand, count, rng=rng) ** self.power
 
 
 def step_times(nfe: int, last_step: float | None = None) -> Tensor:

@@ -11,13 +11,13 @@ depend on its noise (docs/results.md, "Samples and averages").
 Shapes: B batch, N draws per observation, H steps, A action, K noise levels.
 """
 
-from functools import lru_cache
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, ancestral_noise, masked_error, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
@@ -38,12 +38,6 @@ def trailing_levels(num_levels: int, nfe: int, last_step: float | None = None) -
     if last_step is None:
         return [round(num_levels * (nfe - i) / nfe) - 1 for i in range(nfe)]
     return [max(round(num_levels * t) - 1, 0) for t in step_times(nfe, last_step).tolist()[:-1]]
-
-
-@lru_cache(maxsize=8)
-def _kept_on(device: torch.device, num_levels: int) -> Tensor:
-    """`squared_cosine` on a device: copied there in every step it would be waited for."""
-    return squared_cosine(num_levels).to(device)
 
 
 class DenoisingDiffusion:
@@ -79,16 +73,17 @@ class DenoisingDiffusion:
         self.clip_sample, self.clip = clip_sample, clip
         self.draws, self.last_step = draws, last_step
         self.num_levels = num_levels
-        self.kept = squared_cosine(num_levels).tolist()
+        self._kept = squared_cosine(num_levels)
+        self.kept = self._kept.tolist()
 
     def loss(
         self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         x = actions.repeat_interleave(self.draws, dim=0)
-        noise = torch.randn(x.shape, generator=rng, device=rng.device).to(x)
-        k = torch.randint(self.num_levels, (len(x),), generator=rng, device=rng.device)
-        kept = _kept_on(k.device, self.num_levels)[k, None, None]
+        noise = draw(torch.randn, x.shape, rng=rng).to(x)
+        k = draw(torch.randint, self.num_levels, (len(x),), rng=rng)
+        kept = self._kept_on(k.device)[k, None, None]
         signal, spread = kept.sqrt().to(x), (1 - kept).sqrt().to(x)
         z = signal * x + spread * noise
         target = {"epsilon": noise, "sample": x, "v": signal * noise - spread * x}[self.prediction]
@@ -96,6 +91,12 @@ class DenoisingDiffusion:
         output = core(z, t, t, context.repeat(self.draws))
         error = masked_error(output - target, valid.repeat_interleave(self.draws, dim=0))
         return error.unflatten(0, (len(actions), -1)).mean(1), {"denoising_error": error.detach().mean()}
+
+    def _kept_on(self, device: torch.device) -> Tensor:
+        """`squared_cosine` on a device, where it stays: copied there in every step it would be waited for."""
+        if self._kept.device != device:
+            self._kept = self._kept.to(device)
+        return self._kept
 
     def estimate(self, core: nn.Module, z: Tensor, k: int, context: Any) -> tuple[Tensor, Tensor]:
         """Clean action and noise (B, H, A) that the core sees in z (B, H, A) at level k."""

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.generators.base import masked_error, refuse_nfe
 from imfvla.options import above, at_least
 
@@ -58,7 +59,7 @@ class ImplicitMaximumLikelihood:
         """
         batch = len(actions)
         shape = (batch * self.candidates, *actions.shape[1:])
-        noise = torch.randn(shape, generator=rng, device=rng.device).to(actions)
+        noise = draw(torch.randn, shape, rng=rng).to(actions)
         with torch.no_grad():
             chunks = self.chunk(core, context.repeat(self.candidates).detach(noise.dtype), noise)
             distance = self.distances(chunks, actions, valid)

@@ -48,6 +48,7 @@ class StagedMeanFlow(AverageVelocity):
         super().__init__(draws=draws, compound_draws=draws, **options)
         assert velocity_head
         self.average_from, self.path_steps = average_from, path_steps
+        self._path_times: list[float] = step_times(path_steps, self.last_step).tolist()
         self.learns_average: bool | None = None  # None: not told of a step yet
 
     def span(self, name: str, steps: int) -> tuple[float, float]:
@@ -78,7 +79,7 @@ class StagedMeanFlow(AverageVelocity):
         """Mean of v along the flow from z at t to r, without gradient: (B, H, A)."""
         mean, length = torch.zeros_like(z), (t - r)[:, None, None]
         with torch.no_grad():
-            for begin, end in pairwise(step_times(self.path_steps, self.last_step).tolist()):
+            for begin, end in pairwise(self._path_times):
                 v = (begin - end) * self.instant_velocity(core, z, r + (t - r) * begin, context)
                 mean, z = mean + v, z - length * v
         return mean

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.generators.base import masked_error, refuse_nfe
 from imfvla.generators.regression import Regression
 from imfvla.generators.velocity import interpolate
@@ -53,7 +54,7 @@ class TwoStepRegression:
         """Squared error of both answers for each chunk (B,), each with weight 1."""
         first, logs = self.first.loss(core, context, actions, valid, rng)
         x = actions.repeat_interleave(self.draws, dim=0)
-        noise = torch.randn(x.shape, generator=rng, device=rng.device).to(x)
+        noise = draw(torch.randn, x.shape, rng=rng).to(x)
         z, _ = interpolate(x, noise, x.new_full((len(x),), self.level))
         answer = self.correct(core, context.repeat(self.draws), z)
         error = masked_error(answer - x, valid.repeat_interleave(self.draws, dim=0))

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
@@ -87,7 +88,7 @@ class LinearPath:
     def repeat(self, actions: Tensor, valid: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Actions, their noise and validity for all draws, those of an observation together: (B * N, ...)."""
         x = actions.repeat_interleave(self.draws, dim=0)
-        noise = torch.randn(x.shape, generator=rng, device=rng.device).to(x)
+        noise = draw(torch.randn, x.shape, rng=rng).to(x)
         return x, noise, valid.repeat_interleave(self.draws, dim=0)
 
     def adapt(self, error: Tensor) -> Tensor:
@@ -222,8 +223,8 @@ class AverageVelocity(LinearPath):
     def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
         """Times r <= t (count,) of the compound loss."""
         t = self.draw_times(count, rng)
-        r = t * torch.rand(count, generator=rng, device=rng.device)
-        boundary = torch.rand(count, generator=rng, device=rng.device) < self.boundary_share
+        r = t * draw(torch.rand, count, rng=rng)
+        boundary = draw(torch.rand, count, rng=rng) < self.boundary_share
         return r.masked_fill(boundary, 0.0), t.masked_fill(boundary, 1.0)
 
     def compound_rows(self, batch: int, device: torch.device) -> Tensor:

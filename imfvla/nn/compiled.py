@@ -3,6 +3,8 @@
 Context and core are compiled apart, so that the same code serves every generator and any number of evaluations. A
 generator whose loss has a derivative has it in `velocities`, which is compiled with the core in it. The encoder stays
 as it is written: compiled, its convolutions save a hundredth of a step and take a fifth of the time.
+
+A GPU is given the whole loss as one graph, since there the time between kernels counts.
 """
 
 import logging
@@ -29,6 +31,36 @@ def compile_parts(policy: nn.Module, backend: str = "inductor") -> bool:
     A compiled policy computes what it computed before but for rounding (1e-4 of an action's deviation). Without the
     C++ compiler that inductor needs it stays as it is, which a line of the log says. Returns whether it compiles.
     """
+    if not _is_ready(backend):
+        return False
+    policy.core.compile(backend=backend, dynamic=False)
+    for part, name in (
+        (policy.core, "condition"),
+        (policy.core, "instant"),
+        (policy.generator, "velocities"),
+    ):
+        if hasattr(part, name):
+            setattr(part, name, torch.compile(getattr(part, name), backend=backend, dynamic=False))
+    return True
+
+
+def compile_loss(policy: nn.Module, backend: str = "inductor") -> bool:
+    """Compiles the loss of `policy` in place as one graph, which draws its random numbers from an `OwnStream`.
+
+    They are those of the code as it is written. The rest as in `compile_parts`. PyTorch refuses a loss that reads a
+    number of a tensor or calls what cannot be in a graph.
+    """
+    if not _is_ready(backend):
+        return False
+    from torch._inductor import config
+
+    config.fallback_random = True
+    policy.loss = torch.compile(policy.loss, backend=backend, fullgraph=True, dynamic=False)
+    return True
+
+
+def _is_ready(backend: str) -> bool:
+    """Prepares compiling; false, with a line of the log, where inductor cannot."""
     if backend == "inductor":
         if not has_compiler():
             log.warning(
@@ -43,14 +75,6 @@ def compile_parts(policy: nn.Module, backend: str = "inductor") -> bool:
             f"compiling: the next steps take a minute or two, or seconds where {os.environ[CACHE]} has their code"
         )
     warnings.filterwarnings("ignore", "`torch.jit.script_method` is deprecated")  # PyTorch's own use of it
-    policy.core.compile(backend=backend, dynamic=False)
-    for part, name in (
-        (policy.core, "condition"),
-        (policy.core, "instant"),
-        (policy.generator, "velocities"),
-    ):
-        if hasattr(part, name):
-            setattr(part, name, torch.compile(getattr(part, name), backend=backend, dynamic=False))
     return True
 
 

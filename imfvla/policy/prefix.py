@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import draw
 from imfvla.nn.dual import Dual, Same
 
 
@@ -45,7 +46,7 @@ class PrefixInput(nn.Module):
 
     def draw(self, batch: int, rng: torch.Generator) -> Tensor:
         """How many actions are given in each of a batch of chunks (B,): 0 to `most`, all equally often."""
-        return torch.randint(self.most + 1, (batch,), generator=rng, device=rng.device)
+        return draw(torch.randint, self.most + 1, (batch,), rng=rng)
 
     def forward(self, tokens: Tensor, actions: Tensor, given: Tensor) -> Tensor:
         """Tokens (B, L, D), normalised actions (B, Tp, A) and which are given (B, Tp) -> tokens (B, L, D)."""

@@ -31,9 +31,7 @@ class Clipping:
         device: torch.device | str = "cpu",
     ) -> None:
         self.factor, self.norm = factor, norm
-        self.scale = torch.full(
-            (), math.inf if scale is None else scale, dtype=torch.float64, device=device
-        )
+        self.scale = torch.full((), math.inf if scale is None else scale, dtype=torch.float64, device=device)
 
     @property
     def limit(self) -> Tensor:

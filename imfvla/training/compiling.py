@@ -13,13 +13,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from imfvla.nn.compiled import compile_parts, has_compiler
+from imfvla.nn.compiled import compile_loss, compile_parts, has_compiler
 from imfvla.process.progress import LINE_EVERY_S
 from imfvla.training.options import TrainingOptions
 from imfvla.training.parallel import Alone
 from imfvla.training.sharding import NONE
 
 AUTO = "auto"
+ONE_GRAPH_ON = "cuda"  # where the whole loss is compiled as one graph
 EAGER, COMPILED = MODES = ("eager", "compiled")
 DECIDED_AT = 20  # steps
 WORTH_S = 480.0  # a quarter of it is what compiling without earlier code takes
@@ -47,10 +48,19 @@ class Compiling:
             self.mode = decided if is_possible else EAGER
         else:
             self.mode = COMPILED if options.compile else EAGER
+        # Several processes, and parts of a batch, draw from a generator (`WholeBatchDraws`).
+        self._can_be_one_graph = (
+            device.type == ONE_GRAPH_ON and processes.size == 1 and options.accumulate == 1
+        )
         self._times: list[float] = []  # of steps before the decision [s]
         self._lines: _Lines | None = None
         if self.mode == COMPILED:
             self._compile()
+
+    @property
+    def is_one_graph(self) -> bool:
+        """Whether the loss is compiled as a whole, and draws from an `OwnStream`."""
+        return self.mode == COMPILED and self._can_be_one_graph
 
     def took(self, seconds: float, step: int) -> None:
         """Takes the time of step `step` (from 1); step `DECIDED_AT` decides."""
@@ -71,7 +81,8 @@ class Compiling:
             self._lines.close()
 
     def _compile(self) -> None:
-        if compile_parts(self.policy) and self.processes.is_first:
+        compile_it = compile_loss if self.is_one_graph else compile_parts
+        if compile_it(self.policy) and self.processes.is_first:
             self._lines = _Lines()
 
 

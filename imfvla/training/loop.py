@@ -207,6 +207,7 @@ class Trainer:
             seed=step_seed(self.seed, self.step),
             precision=self.precision,
             processes=self.processes,
+            own_stream=self.compiling.is_one_graph,
         )
         self.processes.average_gradients(self.policy.parameters())
         gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]

@@ -1,4 +1,4 @@
-"""What steps have measured, on the policy's device until a row of the log is due: nothing waits for a GPU in between."""
+"""What steps measure, on the policy's device until a row of the log is due: nothing waits for a GPU in between."""
 
 from collections.abc import Iterator, Mapping
 

@@ -19,7 +19,9 @@ def clipped_steps(norms, factor=2.0, norm=None):
 
 
 def takes(clipping, norm, counts=True):
-    return bool(clipping.clip([torch.zeros(3)], torch.tensor(norm, dtype=torch.float64), torch.tensor(counts)))
+    return bool(
+        clipping.clip([torch.zeros(3)], torch.tensor(norm, dtype=torch.float64), torch.tensor(counts))
+    )
 
 
 def norms(count=400):

@@ -6,10 +6,10 @@ from functools import partial
 
 import pytest
 import torch
-from test_loop import Killed, StagedPolicy, assert_same_run, details_of
+from test_loop import Killed, StagedPolicy, assert_same_run, details_of, untimed_metrics
 from tiny_policy import OPTIONS
 
-from imfvla.nn.compiled import compile_parts
+from imfvla.nn.compiled import compile_loss, compile_parts
 from imfvla.training import compiling
 from imfvla.training.compiling import COMPILED, DECIDED_AT, EAGER, WORTH_S, Compiling
 from imfvla.training.parallel import Alone
@@ -79,12 +79,15 @@ def test_auto_leaves_gpus_shards_and_machines_without_a_compiler_alone(compiled,
     assert not compiled
 
 
+@pytest.mark.parametrize("one_graph", [False, True], ids=["parts", "one graph"])
 @pytest.mark.parametrize(("decided_at", "killed_at"), [(2, 1), (1, 3)])
 def test_a_run_that_goes_on_compiled_resumes_bit_for_bit(
-    tmp_path, make_trainer, monkeypatch, caplog, decided_at, killed_at
+    tmp_path, make_trainer, monkeypatch, caplog, decided_at, killed_at, one_graph
 ):
     """Killed before the step that decides, and after it in the second stage, which other code computes."""
     monkeypatch.setattr(compiling, "compile_parts", partial(compile_parts, backend="aot_eager"))
+    monkeypatch.setattr(compiling, "compile_loss", partial(compile_loss, backend="aot_eager"))
+    monkeypatch.setattr(compiling, "ONE_GRAPH_ON", "cpu" if one_graph else "cuda")
     monkeypatch.setattr(compiling, "has_compiler", lambda: True)
     monkeypatch.setattr(compiling, "DECIDED_AT", decided_at)
     monkeypatch.setattr(compiling, "WORTH_S", 0.0)
@@ -99,5 +102,10 @@ def test_a_run_that_goes_on_compiled_resumes_bit_for_bit(
     resumed = make_trainer(tmp_path / "resumed", StagedPolicy(), compile="auto")
     assert resumed.step == killed_at
     resumed.train()
+    assert resumed.compiling.is_one_graph == one_graph
     assert_same_run(whole.run, resumed.run)
+    eager = make_trainer(tmp_path / "eager", StagedPolicy())
+    eager.train()
+    for row, expected in zip(untimed_metrics(whole.run), untimed_metrics(eager.run), strict=True):
+        assert row == pytest.approx(expected, rel=1e-4)
     torch.compiler.reset()

@@ -6,11 +6,14 @@ from dataclasses import fields
 
 import pytest
 import torch
+import torch._dynamo.trace_rules  # looks functions up when it is imported, which must be before one is replaced
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from imfvla.command.composition import choices_of, compose
 from imfvla.command.rehearsal import build_unfitted
+from imfvla.draws import OwnStream
+from imfvla.nn.compiled import compile_loss
 from imfvla.policy.blank import blank_observation
 from imfvla.training.parallel import DRAWS
 from imfvla.training.precision import autocast
@@ -18,6 +21,7 @@ from imfvla.types import Batch, Observation
 
 META = torch.device("meta")
 SMALL = ("observation.image_size=[64,64]",)
+SHALLOW = ("core.depth=1",)
 
 
 class DrawsOnMeta(TorchFunctionMode):
@@ -59,7 +63,7 @@ def batch_for(policy, rows: int = 2) -> Batch:
     return Batch(seen, torch.zeros(rows, *policy.noise_shape), valid)
 
 
-@pytest.mark.parametrize(
+EVERY_LOSS = pytest.mark.parametrize(
     "overrides",
     [
         *(
@@ -72,6 +76,9 @@ def batch_for(policy, rows: int = 2) -> Batch:
     ],
     ids=" ".join,
 )
+
+
+@EVERY_LOSS
 def test_a_loss_neither_reads_numbers_nor_brings_them(overrides, monkeypatch):
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda *_: False)  # which "meta" has not
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
@@ -89,6 +96,23 @@ def test_a_loss_neither_reads_numbers_nor_brings_them(overrides, monkeypatch):
         rehearsed = True
         assert drawn.draws > 0 or not getattr(policy.generator, "uses_noise", True)
         assert {value.device for value in (loss, *logs.values())} == {META}
+
+
+@EVERY_LOSS
+def test_a_loss_is_one_graph_that_computes_the_same(overrides):
+    policy = build_unfitted(compose("train", [*overrides, *SMALL, *SHALLOW])).train()
+    batch, rng, graphs = batch_for(policy), OwnStream(torch.device("cpu")), []
+    torch._dynamo.reset()
+    eager = policy.loss
+    assert compile_loss(policy, backend=lambda graph, _: graphs.append(graph) or graph)
+    for step in range(2):  # one of each stage, where there are two
+        policy.begin_step(step, 2)
+        torch.manual_seed(0)
+        expected, _ = eager(batch, rng)
+        torch.manual_seed(0)
+        found, _ = policy.loss(batch, rng)
+        assert torch.equal(found, expected)
+    assert len(graphs) == (2 if policy.has_stages else 1)
 
 
 @pytest.mark.parametrize("generator", ["imf", "imf_plain", "flow", "ddpm", "l1"])

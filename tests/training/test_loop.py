@@ -61,18 +61,17 @@ class StagedPolicy(nn.Module):
             parametrisation="data", times=HighNoiseTimes(), velocity_head=True, average_from=0.5, path_steps=2,
             boundary_share=0.5, time_power=2.0, adaptive_power=0.5, adaptive_offset=1e-3, draws=2, clip=10.0,
         )  # fmt: skip
-        self.dies_at, self.step = dies_at, 0
+        self.dies_at = dies_at
 
     def spans(self, steps):
         return {name: self.generator.span(name, steps) for name, _ in self.named_parameters()}
 
     def begin_step(self, step, steps):
-        self.step = step
         self.generator.begin_step(self.core, step, steps)
+        if step == self.dies_at and not self.training:  # the average, which is told last
+            raise Killed()
 
     def loss(self, batch, rng):
-        if self.step == self.dies_at:
-            raise Killed()
         context = self.core.condition(self.encoder(batch.obs.state))
         loss, logs = self.generator.loss(self.core, context, batch.actions, batch.valid, rng)
         return loss.mean(), logs
