@@ -15,6 +15,7 @@ import numpy as np
 from imfvla.errors import UserError
 from imfvla.options import build, require
 
+FRAMES = RELATIVE, ABSOLUTE = "relative", "absolute"  # of the actions that a policy learns
 MAX_CHANNELS = 1000
 MAX_CAMERAS = 64
 MIN_CONTROL_HZ, MAX_CONTROL_HZ = 0.01, 10_000.0

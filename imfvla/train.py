@@ -16,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from imfvla.command.composition import CONFIG_DIRECTORY
 from imfvla.command.entry import entry_point, output_directory
 from imfvla.storage.run_directory import RunDirectory
+from imfvla.training.experiment import read_experiment
 
 
 def usage() -> str:
@@ -36,6 +37,7 @@ def is_finished(config: dict[str, Any], directory: Path) -> bool:
 
 @entry_point("train", is_finished, usage)
 def main(config: dict[str, Any]) -> None:
+    read_experiment(config)
     # Imported late, so that a mistake in the config is reported at once.
     from imfvla.command.experiment import run_experiment
 

@@ -36,8 +36,8 @@ from imfvla.storage.run_directory import RunDirectory
 from imfvla.training.experiment import read_experiment
 from imfvla.training.logger import read_metrics
 from imfvla.training.loop import Trainer
+from imfvla.training.options import SHARDINGS
 from imfvla.training.parallel import joined_processes
-from imfvla.training.sharding import SHARDINGS
 from imfvla.training.train_state import save_state
 from imfvla.types import MAX_WORDS, Batch, Observation
 

@@ -9,9 +9,8 @@ from torch import Tensor, nn
 from imfvla.data.statistics import Statistics
 from imfvla.errors import UserError
 from imfvla.nn.normaliser import Normaliser
-from imfvla.robot import RobotSpec
+from imfvla.robot import FRAMES, RELATIVE, RobotSpec
 
-FRAMES = RELATIVE, ABSOLUTE = "relative", "absolute"
 MIN_SCALE = 2e-3  # in the unit of the channel: rad, m, a share of an opening
 
 

@@ -15,9 +15,8 @@ from torch import nn
 
 from imfvla.nn.compiled import compile_loss, compile_parts, has_compiler
 from imfvla.process.progress import LINE_EVERY_S
-from imfvla.training.options import TrainingOptions
+from imfvla.training.options import NONE, TrainingOptions
 from imfvla.training.parallel import Alone
-from imfvla.training.sharding import NONE
 
 AUTO = "auto"
 ONE_GRAPH_ON = "cuda"  # where the whole loss is compiled as one graph

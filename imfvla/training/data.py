@@ -1,12 +1,13 @@
 """Batches for a composed config: frame store, windows, augmentation, loader."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from imfvla.config.horizon import Horizon
 from imfvla.config.views import view_options
-from imfvla.data import FrameStore, Loader, ResumableSampler, Windows
+from imfvla.data import Augmentation, FrameStore, Loader, ResumableSampler, Windows
 from imfvla.data.held_out import held_out
 from imfvla.options import build
 from imfvla.process.progress import Progress
@@ -95,7 +96,7 @@ def make_loader(options: ExperimentOptions, windows: Windows) -> Loader:
     return Loader(
         windows,
         sampler,
-        augment=options.augmentation,
+        augment=Augmentation(**asdict(options.augmentation)),
         prefetch=training.prefetch,
         threads=training.loader_threads,
     )

@@ -1,15 +1,15 @@
-"""The config of an experiment as one object, read once from `conf/train.yaml` composed."""
+"""The config of an experiment as one object, read from `conf/train.yaml` composed. Needs neither torch nor mujoco."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, Any
 
+from imfvla.config.augmentation import AugmentationOptions
 from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import MAX_SEED, EvaluationOptions
 from imfvla.config.views import ViewOptions
-from imfvla.data import Augmentation
 from imfvla.options import build, one_of, part_of, within
-from imfvla.policy.chunks import FRAMES
+from imfvla.robot import FRAMES
 from imfvla.storage.records import FileName
 from imfvla.training.options import OptimOptions, TrainingOptions
 
@@ -22,7 +22,7 @@ class ExperimentOptions:
     seed: Annotated[int, within(0, MAX_SEED)]
     action_frame: Annotated[str, one_of(*FRAMES)]
     horizon: Horizon
-    augmentation: Augmentation
+    augmentation: AugmentationOptions
     observation: ViewOptions
     training: TrainingOptions
     optim: OptimOptions

@@ -29,12 +29,12 @@ from imfvla.training.ema import Ema
 from imfvla.training.logger import MetricsLogger, SilentLogger
 from imfvla.training.non_finite import NonFinite, name_cause
 from imfvla.training.optimiser import make_optimiser
-from imfvla.training.options import OptimOptions, TrainingOptions
+from imfvla.training.options import FULL, OptimOptions, TrainingOptions
 from imfvla.training.origin import Origin
 from imfvla.training.parallel import Alone
 from imfvla.training.precision import PRECISIONS, allow_tf32, choose_precision
 from imfvla.training.schedule import learning_rate
-from imfvla.training.sharding import FULL, shard, whole
+from imfvla.training.sharding import shard, whole
 from imfvla.training.spans import Span, Spans
 from imfvla.training.train_state import TrainState, load_state, save_state
 from imfvla.training.transfer import Sent, Transfer

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from imfvla.options import SHARE_BELOW_1, above, at_least, one_of, require, within
-from imfvla.training.sharding import SHARDINGS
 
+SHARDINGS = NONE, FULL = "none", "full"
 # Far beyond useful values: anything larger is a typo and would fail late.
 MAX_STEPS, MAX_BATCH, MAX_CHECKPOINTS, MAX_PREFETCH, MAX_THREADS = 10**9, 10**6, 10**4, 1024, 1024
 

@@ -26,8 +26,8 @@ from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
 from imfvla.errors import UserError
-from imfvla.training.options import TrainingOptions
-from imfvla.training.sharding import NONE, forget_layouts, is_part
+from imfvla.training.options import NONE, TrainingOptions
+from imfvla.training.sharding import forget_layouts, is_part
 from imfvla.types import Batch, Observation
 
 TIMEOUT = timedelta(days=1)  # others wait while process 0 collects demonstrations

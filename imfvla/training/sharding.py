@@ -20,9 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from imfvla.errors import UserError
-
-NONE, FULL = "none", "full"
-SHARDINGS = (NONE, FULL)
+from imfvla.training.options import FULL, NONE
 
 
 def shard(module: nn.Module, device: torch.device, *, loss: str | None = None) -> None:

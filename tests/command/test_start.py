@@ -23,13 +23,17 @@ print(code, *(module for module in {SLOW} if module in sys.modules), file=sys.st
     [
         "train +exp=socket_ph32_exec16 seeed=1",
         "train +exp=sockett",
+        "train training.steps=abc",
+        "train action_frame=absolut",
         "evaluate",
         "evaluate run=nowhere",
+        "evaluate run=nowhere nfe=abc",
         "compare",
         "compare nowhere elsewhere",
         "report run=nowhere",
         "collect episode=3",
         "bench parts=[speed]",
+        "bench steps=abc",
         "convert from=lerobot",
     ],
 )
