@@ -60,6 +60,11 @@ def label(changes: Sequence[tuple[str, Any]]) -> str:
     return ", ".join(unusual({**USUAL, "delay_steps": None, **dict(changes)}))
 
 
+def world(changes: Sequence[tuple[str, Any]]) -> str:
+    """`label` without how many episodes are played side by side, which changes their rounding alone."""
+    return label([(key, value) for key, value in changes if key != "batch"])
+
+
 def short_labels(rows: Sequence[TableRow]) -> tuple[dict[str, str], str]:
     """By the label of each row, its method and what not all rows have, such as "ACT (infer1)"; then what all have."""
     parts = {row.label: row.setting.split(", ") for row in rows}

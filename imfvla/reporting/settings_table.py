@@ -1,6 +1,6 @@
 """A table of settings: success in each, and what it loses against the unchanged world, start by start."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
@@ -9,7 +9,7 @@ from imfvla.reporting.measured import Measured
 from imfvla.reporting.metrics import condition_happened
 from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, name_of, short_labels
+from imfvla.reporting.settings import label, name_of, short_labels, world
 from imfvla.reporting.significance import holm
 from imfvla.reporting.table import MISSING, REFUSED, Table, interval
 from imfvla.reporting.tables import Document
@@ -57,8 +57,8 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     told = {one.usual.name: one.usual for one in found}
     usual = {name: told[name] for name in table.rows if name in told}
     names, shared = short_labels([result.row for result in usual.values()])
-    settings = list(dict.fromkeys(label(one.result.row.changes) for one in found))
-    cells = {(label(one.result.row.changes), one.usual.name): one for one in found}
+    settings = list(dict.fromkeys(world(one.result.row.changes) for one in found))
+    cells = {(world(one.result.row.changes), one.usual.name): one for one in found}
     rows = [(UNCHANGED, *(_usual_cell(result) for result in usual.values()))]
     lines = [tuple(cells.get((text, name)) for name in usual) for text in settings]
     rows += [(text, *map(_cell, line)) for text, line in zip(settings, lines, strict=True)]
@@ -73,6 +73,7 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
             _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
             for name in usual
         ),
+        *_side_by_side(names, found),
         *_events([one.result for one in found]),
         *(f"{one.result.name}: refused, because {one.refused}." for one in found if one.refused),
     ]
@@ -136,9 +137,20 @@ def _sentence(method: str, measured: Sequence[Changed]) -> str:
         else f"no setting of {len(measured)} in which fewer successes are told from chance"
     )
     return (
-        f"{method}: {told}; the lowest is {label(worst.result.row.changes)} with {percent.value:+.0f} points "
+        f"{method}: {told}; the lowest is {world(worst.result.row.changes)} with {percent.value:+.0f} points "
         f"{interval(percent, 0)}."
     )
+
+
+def _side_by_side(names: Mapping[str, str], found: Sequence[Changed]) -> list[str]:
+    """What is said of methods of which a worker plays several episodes at a time."""
+    sizes = {
+        one.usual.row.label: size for one in found if (size := dict(one.result.row.changes).get("batch"))
+    }
+    return [
+        f"{names[method]}: {size} episodes side by side, which changes the rounding of a chunk alone."
+        for method, size in sizes.items()
+    ]
 
 
 def _events(results: Sequence[Result]) -> list[str]:
@@ -146,7 +158,7 @@ def _events(results: Sequence[Result]) -> list[str]:
     counts: dict[str, list[list[int]]] = {}
     for result in results:
         if _has_event(result):
-            counts.setdefault(label(result.row.changes), []).append(condition_happened(result.episodes))
+            counts.setdefault(world(result.row.changes), []).append(condition_happened(result.episodes))
     return [
         f"{text}: the event came in {sum(came for came, _ in told)} of {sum(every for _, every in told)} episodes of "
         "all rows."

@@ -125,6 +125,25 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
     assert lines[2]["delay_steps"] == "6"
 
 
+def test_a_method_that_is_played_side_by_side_has_the_lines_of_the_others(tmp_path):
+    entries = (
+        {"condition": "bump", "severity": 2, "rows": [BASES[0]]},
+        {"condition": "bump", "severity": 2, "batch": 8, "rows": [BASES[1]]},
+    )
+    sources = Sources([tmp_path])
+    found = [
+        Result.of(sources.answer(row, MAPPING))
+        for row in (*(BY_NAME[name] for name in BASES), *rows(*entries))
+    ]
+    document = settings_table(TABLE, found)
+    assert [line[0] for line in document.shown.rows] == ["unchanged", "bump 2"]
+    assert "L1 regression: 8 episodes side by side, which" in " ".join(document.shown.notes)
+    assert [line["setting"] for line in csv.DictReader(io.StringIO(document.data.csv()))][2:] == [
+        "bump 2",
+        "bump 2, batch 8",
+    ]
+
+
 def test_cells_lead_to_their_rows_and_rows_show_their_videos(results, tmp_path):
     folder = results[2].first.folder
     (folder / "best_seed1.mp4").write_bytes(b"")
