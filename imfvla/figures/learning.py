@@ -98,6 +98,8 @@ def _kind(evaluation: Evaluation) -> dict[str, Any]:
     """The generator, and those of its options that the unit of the loss depends on."""
     generator = evaluation.config.get("generator", {})
     units = {key: generator[key] for key in UNITS if key in generator}
+    if _class(generator) == "Regression":
+        units.setdefault("power", 1)  # configs from before there was L2 do not say it
     return {"class": _class(generator), **units}
 
 

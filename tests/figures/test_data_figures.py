@@ -163,6 +163,17 @@ def test_losses_in_different_units_share_no_panel(tmp_path):
     assert {"imf", "imf, seed 1"} <= set(texts(figure))
 
 
+def test_configs_from_before_a_key_share_the_panel_of_its_usual_value(tmp_path):
+    regression = {"_target_": "imfvla.generators.regression.Regression"}
+    for name, options in {"old": {}, "l1": {"power": 1}, "l2": {"power": 2}}.items():
+        write_evaluation(
+            make_run(tmp_path / name / "default", name, generator=regression | options), 1, number=100
+        )
+    figure = learning_curves([Result(evaluated) for evaluated in Sources([tmp_path]).others([])])
+    panels = {axes.get_title(loc="left"): len(axes.lines) for axes in figure.axes if axes.lines}
+    assert panels == {"L1 regression": 2, "L2 regression": 1}
+
+
 @pytest.mark.parametrize(
     ("last", "scale", "label"), [(0.1, "log", "loss, log axis"), (-0.1, "linear", "loss")]
 )
