@@ -6,7 +6,7 @@ from itertools import groupby
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from imfvla.figures.panels import look, nfe_ticks, plain_log_ticks, say_nothing_yet
+from imfvla.figures.panels import look, nfe_ticks, numbers, plain_log_ticks, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
 from imfvla.reporting.curves import training_minutes
@@ -33,10 +33,11 @@ def success_by_cost(results: Sequence[Result]) -> Figure:
             for axes in (left, right):
                 say_nothing_yet(axes, "no row measured yet")
             return figure
-        for number, method in enumerate(order):
+        looks = numbers([lines[method][0] for method in order])
+        for place, (method, number) in enumerate(zip(order, looks, strict=True)):
             line = lines[method]
             # so that intervals do not hide each other, and yet stand at their tick
-            shift = SPREAD ** ((number + 0.5) / len(order) - 0.5)
+            shift = SPREAD ** ((place + 0.5) / len(order) - 0.5)
             _draw(left, line, [shift * r.nfe for r in line], number, method)
             _draw(right, line, [r.metrics["inference_ms_median"].value for r in line], number, method)
         nfe_ticks(left, (r.nfe for r in measured))

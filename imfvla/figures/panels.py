@@ -1,6 +1,7 @@
 """Panels that several figures share: one for each task, legends, axes."""
 
 from collections.abc import Iterable, Sequence
+from itertools import count
 
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -79,6 +80,31 @@ def nfe_ticks(axes: Axes, nfes: Iterable[int]) -> list[int]:
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
     return ticks
+
+
+# The number, for `look`, of each generator: its colour in every figure that compares methods.
+NUMBERS = {
+    "StagedMeanFlow": 0, "FlowMatching": 1, "DenoisingDiffusion": 2, "ActionChunking": 4, "ImprovedMeanFlow": 5,
+    "Regression": 6,
+}  # fmt: skip
+
+
+def numbers(results: Sequence[Result]) -> list[int]:
+    """A number for each result, of another method each: that of its generator, else the lowest that is left."""
+    usual = [NUMBERS.get(_generator(result)) for result in results]
+    left = (number for number in count() if number not in usual)
+    taken: set[int] = set()
+    found = []
+    for number in usual:
+        own = next(left) if number is None or number in taken else number
+        taken.add(own)
+        found.append(own)
+    return found
+
+
+def _generator(result: Result) -> str:
+    """The class of its generator."""
+    return str(result.first.config.get("generator", {}).get("_target_", "")).rpartition(".")[2]
 
 
 def look(number: int) -> dict[str, str]:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from imfvla.config.condition import NONE, SEVERITIES
 from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, NO_PREFIX, PREFIXES, RUNNING
-from imfvla.figures.panels import LINES, say_nothing_yet
+from imfvla.figures.panels import LINES, numbers, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import CYCLE, MARKERS, WIDTH, new_figure, style
 from imfvla.reporting.results import Result
@@ -150,12 +150,15 @@ def _looks(results: Sequence[Result]) -> tuple[dict[Line, dict[str, str]], str]:
     """
     changed = [result for result in results if result.row.changes]
     names, shared = short_labels([result.row for result in changed])
-    policies = list(dict.fromkeys((result.row.experiment, result.row.overrides) for result in changed))
+    policies: dict[tuple[str, tuple[str, ...]], Result] = {}
+    for result in changed:
+        policies.setdefault((result.row.experiment, result.row.overrides), result)
+    places = dict(zip(policies, numbers(list(policies.values())), strict=True))
     nfes = sorted({result.row.nfe for result in changed})
     found = {}
     for result in sorted(changed, key=lambda result: PREFIXES.index(_line(result)[1])):
         label, prefix = line = _line(result)
-        turn, colour = divmod(policies.index((result.row.experiment, result.row.overrides)), len(CYCLE))
+        turn, colour = divmod(places[result.row.experiment, result.row.overrides], len(CYCLE))
         found[line] = {
             "label": names[label] if prefix == NO_PREFIX else f"{names[label]}, {prefix} prefix",
             "color": CYCLE[colour],

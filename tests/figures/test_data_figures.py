@@ -14,7 +14,7 @@ from imfvla.figures.evaluations import success_by_evaluations
 from imfvla.figures.failures import failed_stages
 from imfvla.figures.learning import learning_curves
 from imfvla.figures.methods import success_by_cost
-from imfvla.figures.panels import panels_of
+from imfvla.figures.panels import look, numbers, panels_of
 from imfvla.figures.reward_latency import errors, pareto_frontier, reward_latency
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
@@ -71,6 +71,18 @@ def test_costs_are_shown_for_each_method_with_its_trainings(results):
         assert list(np.round(found / found[0])) in ([1, 2, 10], [1])
     several = [np.round(found / found[0], 1).tolist() for found in times if len(found) == 3]
     assert several == 4 * [[1, 1.7, 7.2]]  # two forms of iMF, flow matching, DDIM
+
+
+def test_a_method_has_the_number_of_its_generator_and_others_what_is_left(tmp_path):
+    kinds = ("imf.ImprovedMeanFlow", "outside.Mine", "flow.FlowMatching", "flow.FlowMatching", "imle.Other")
+    for place, kind in enumerate(kinds):
+        run = make_run(
+            tmp_path / f"{place}" / "default", f"e{place}", generator={"_target_": f"imfvla.{kind}"}
+        )
+        write_evaluation(run, 1, number=100)
+    results = [Result(evaluated) for evaluated in Sources([tmp_path]).others([])]
+    assert numbers(results) == [5, 0, 1, 2, 3]
+    assert len({tuple(look(number).items()) for number in numbers(results * 4)}) == 20
 
 
 def test_the_frontier_is_what_nothing_beats_in_both():
