@@ -18,7 +18,10 @@ class OwnStream:
     device: torch.device
 
 
-def draw(function: Callable[..., Tensor], *arguments: Any, rng: torch.Generator | OwnStream) -> Tensor:
+Stream = torch.Generator | OwnStream
+
+
+def draw(function: Callable[..., Tensor], *arguments: Any, rng: Stream) -> Tensor:
     """What `function`, which is `torch.rand`, `randn` or `randint`, draws from `rng` on its device."""
     generator = rng if isinstance(rng, torch.Generator) else None
     return function(*arguments, generator=generator, device=rng.device)

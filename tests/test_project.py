@@ -88,7 +88,7 @@ def test_commands_in_documents_compose_and_build(command):
 
 # A package, or a module of the root, imports only from lines above its own.
 LAYERS = [
-    "errors types",
+    "draws errors types",
     "options process",
     "config robot",
     "storage",
@@ -114,14 +114,14 @@ LAYER = {room: number for number, rooms in enumerate(LAYERS) for room in rooms.s
 # What some of them must not know, though it lies above them: nn no robot, tables no simulator.
 ONLY = {
     "encoders": "errors nn types",
-    "generators": "errors nn options",
-    "nn": "errors options storage",
+    "generators": "draws errors nn options",
+    "nn": "draws errors options storage",
     "reporting": "config episode errors options process robot storage",
     "storage": "config errors options process",
 }
 SIMULATE = "tasks gymnasium_env"
 WHO_MAY = {  # of the heavy packages
-    "torch": "types nn encoders generators data policy training runtime modes rollouts deployment command "
+    "torch": "draws types nn encoders generators data policy training runtime modes rollouts deployment command "
     "benchmarks bench",
     "mujoco": f"{SIMULATE} conditions",
     "dm_control": SIMULATE,

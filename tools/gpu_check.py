@@ -19,6 +19,7 @@ if __name__ == "__main__":
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 import time
@@ -185,7 +186,8 @@ def measure_training(effort: Effort, device: torch.device) -> dict[str, dict[str
 def run_steps(trainer: Trainer, steps: int) -> None:
     for _ in range(steps):
         trainer._update(next(trainer.batches))
-    list(trainer.unread.read())  # waits for the device
+    losses = [scalars["loss"] for _, scalars in trainer.unread.read()]  # waits for the device
+    assert all(map(math.isfinite, losses)), losses
 
 
 def measure_latency(effort: Effort, device: torch.device) -> dict[str, dict[str, dict[str, float]]]:

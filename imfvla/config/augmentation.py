@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from imfvla.errors import UserError
 
-MAX_GAIN = 1.98  # keeps (pixel - 128) * gain and its rounding within int16
+MAX_GAIN = 1.98  # keeps (pixel - 128) * gain and its rounding within int16, as `data.augment` computes it
 MAX_SHIFT_PX = 1000
 
 

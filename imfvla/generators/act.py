@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.generators.base import masked_mean, refuse_nfe
 from imfvla.options import above, at_least
 
@@ -32,7 +32,7 @@ class ActionChunking:
         self.clip = clip
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,)."""
         mean, log_variance = (part.to(actions) for part in core.style(context, actions, valid))

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.errors import UserError
 from imfvla.options import above, at_least, within
 
@@ -40,12 +40,12 @@ class Generator(Protocol):
     core_interface: str  # how it calls the core: "flow", "flow and v-head" or "style"
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,) for actions (B, H, A) and valid (B, H), and scalars without gradient to log.
 
-        `rng` is a generator of the actions' device, or of the CPU: draw where it is, then move, as in
-        `draw(torch.randn, x.shape, rng=rng).to(x)`. Of several draws (B * N, H, A) those of an
+        `rng` is of the actions' device, or of the CPU: draw where it is, then move, as in
+        `draw(torch.randn, x.shape, rng=rng).to(x)` with `imfvla.draws.draw`. Of several draws (B * N, H, A) those of an
         observation lie side by side, and the loss is their mean. A loss reads no number of a tensor, such as by
         `.item()`, and makes none of Python's numbers: a GPU would be waited for.
         """
@@ -93,13 +93,13 @@ def uses_noise(generator: Generator) -> bool:
 
 
 LAST_STEP = within(0.01, 0.99)  # a time between noise and data
-TimeSampler = Callable[[int, torch.Generator], Tensor]  # how many, from which stream -> (n,) in [0, 1]
+TimeSampler = Callable[[int, Stream], Tensor]  # how many, from which stream -> (n,) in [0, 1]
 
 
 class UniformTimes:
     """t ~ U[0, 1]."""
 
-    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+    def __call__(self, count: int, rng: Stream) -> Tensor:
         return draw(torch.rand, count, rng=rng)
 
 
@@ -109,7 +109,7 @@ class BetaTimes:
     def __init__(self, alpha: Annotated[float, above(0)], span: Annotated[float, within(0, 1)]) -> None:
         self.alpha, self.span = alpha, span
 
-    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+    def __call__(self, count: int, rng: Stream) -> Tensor:
         return 1 - self.span * (1 - draw(torch.rand, count, rng=rng) ** (1 / self.alpha))
 
 
@@ -119,7 +119,7 @@ class LogitNormalTimes:
     def __init__(self, mean: float, std: Annotated[float, at_least(0)]) -> None:
         self.mean, self.std = mean, std
 
-    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+    def __call__(self, count: int, rng: Stream) -> Tensor:
         return torch.sigmoid(self.mean + self.std * draw(torch.randn, count, rng=rng))
 
 
@@ -134,7 +134,7 @@ class HighNoiseTimes:
     ) -> None:
         self.span, self.power = span, power
 
-    def __call__(self, count: int, rng: torch.Generator) -> Tensor:
+    def __call__(self, count: int, rng: Stream) -> Tensor:
         return 1 - self.span * draw(torch.rand, count, rng=rng) ** self.power
 
 

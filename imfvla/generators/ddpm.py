@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, ancestral_noise, masked_error, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
@@ -26,9 +26,12 @@ from imfvla.options import above
 MAX_BETA = 0.999
 
 
-def squared_cosine(num_levels: int) -> Tensor:
-    """abar (K,), float64: products of 1 - beta_k, beta_k = min(1 - f(k + 1) / f(k), 0.999), f = squared cosine."""
-    edges = torch.arange(num_levels + 1, dtype=torch.float64) / num_levels
+def squared_cosine(num_levels: int, device: torch.device | None = None) -> Tensor:
+    """abar (K,), float64: products of 1 - beta_k, beta_k = min(1 - f(k + 1) / f(k), 0.999), f = squared cosine.
+
+    Computed on `device`: a GPU would be waited for while it is copied there.
+    """
+    edges = torch.arange(num_levels + 1, dtype=torch.float64, device=device) / num_levels
     kept = torch.cos((edges + 0.008) / 1.008 * torch.pi / 2) ** 2
     return (1 - (1 - kept[1:] / kept[:-1]).clamp(max=MAX_BETA)).cumprod(0)
 
@@ -73,17 +76,16 @@ class DenoisingDiffusion:
         self.clip_sample, self.clip = clip_sample, clip
         self.draws, self.last_step = draws, last_step
         self.num_levels = num_levels
-        self._kept = squared_cosine(num_levels)
-        self.kept = self._kept.tolist()
+        self.kept = squared_cosine(num_levels).tolist()
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         x = actions.repeat_interleave(self.draws, dim=0)
         noise = draw(torch.randn, x.shape, rng=rng).to(x)
         k = draw(torch.randint, self.num_levels, (len(x),), rng=rng)
-        kept = self._kept_on(k.device)[k, None, None]
+        kept = squared_cosine(self.num_levels, k.device)[k, None, None]
         signal, spread = kept.sqrt().to(x), (1 - kept).sqrt().to(x)
         z = signal * x + spread * noise
         target = {"epsilon": noise, "sample": x, "v": signal * noise - spread * x}[self.prediction]
@@ -91,12 +93,6 @@ class DenoisingDiffusion:
         output = core(z, t, t, context.repeat(self.draws))
         error = masked_error(output - target, valid.repeat_interleave(self.draws, dim=0))
         return error.unflatten(0, (len(actions), -1)).mean(1), {"denoising_error": error.detach().mean()}
-
-    def _kept_on(self, device: torch.device) -> Tensor:
-        """`squared_cosine` on a device, where it stays: copied there in every step it would be waited for."""
-        if self._kept.device != device:
-            self._kept = self._kept.to(device)
-        return self._kept
 
     def estimate(self, core: nn.Module, z: Tensor, k: int, context: Any) -> tuple[Tensor, Tensor]:
         """Clean action and noise (B, H, A) that the core sees in z (B, H, A) at level k."""

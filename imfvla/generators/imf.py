@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import Stream
 from imfvla.errors import UserError
 from imfvla.generators.base import masked_error
 from imfvla.generators.velocity import AverageVelocity, interpolate
@@ -53,7 +54,7 @@ class ImprovedMeanFlow(AverageVelocity):
         self.compound_target = compound_target
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         batch = len(actions)

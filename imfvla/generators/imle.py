@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.generators.base import masked_error, refuse_nfe
 from imfvla.options import above, at_least
 
@@ -51,7 +51,7 @@ class ImplicitMaximumLikelihood:
         return error.sqrt().unflatten(0, (len(actions), self.candidates))
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Distance of the nearest candidate that is not rejected, for each chunk (B,); 0 where all of them are.
 

@@ -9,9 +9,9 @@ Shapes: B batch, N draws per observation, H steps, A action.
 
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
+from imfvla.draws import Stream
 from imfvla.generators.base import masked_error
 from imfvla.generators.velocity import AverageVelocity, Pushes, interpolate
 
@@ -25,7 +25,7 @@ class MeanFlow(AverageVelocity):
         return v - change, change
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws."""
         batch = len(actions)

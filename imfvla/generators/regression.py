@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import Stream
 from imfvla.generators.base import masked_mean, refuse_nfe
 from imfvla.options import above, one_of
 
@@ -31,7 +32,7 @@ class Regression:
         return core(torch.zeros_like(like), t, torch.zeros_like(t), context)
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean error of each chunk (B,), absolute or squared; nothing is drawn from `rng`."""
         error = masked_mean((self.predict(core, context, actions) - actions).abs() ** self.power, valid)

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import Stream
 from imfvla.errors import UserError
 from imfvla.generators.base import masked_error, step_times
 from imfvla.generators.velocity import AverageVelocity, interpolate
@@ -90,7 +91,7 @@ class StagedMeanFlow(AverageVelocity):
         return super().sample(core if takes_average else self.instant_core(core), context, noise, nfe)
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of each chunk (B,), a mean over its draws: of v in the first stage, of u in the second."""
         batch = len(actions)

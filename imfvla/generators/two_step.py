@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.generators.base import masked_error, refuse_nfe
 from imfvla.generators.regression import Regression
 from imfvla.generators.velocity import interpolate
@@ -49,7 +49,7 @@ class TwoStepRegression:
         return core(z, t, t, context)
 
     def loss(
-        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: torch.Generator
+        self, core: nn.Module, context: Any, actions: Tensor, valid: Tensor, rng: Stream
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Squared error of both answers for each chunk (B,), each with weight 1."""
         first, logs = self.first.loss(core, context, actions, valid, rng)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.errors import UserError
 from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
@@ -76,7 +76,7 @@ class LinearPath:
         """v(z, t), u where the interval has no length: z (B, H, A), t (B,) -> (B, H, A)."""
         return self.velocity(core, z, t, t, context)
 
-    def draw_times(self, count: int, rng: torch.Generator) -> Tensor:
+    def draw_times(self, count: int, rng: Stream) -> Tensor:
         """Times t (count,) to train at; in the data form none is below MIN_TIME.
 
         The draw is bounded, not the division: at a smaller t, (z - D) / max(t, MIN_TIME) is no velocity of the path,
@@ -85,7 +85,7 @@ class LinearPath:
         t = self.times(count, rng)
         return t.clamp(min=MIN_TIME) if self.parametrisation == "data" else t
 
-    def repeat(self, actions: Tensor, valid: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    def repeat(self, actions: Tensor, valid: Tensor, rng: Stream) -> tuple[Tensor, Tensor, Tensor]:
         """Actions, their noise and validity for all draws, those of an observation together: (B * N, ...)."""
         x = actions.repeat_interleave(self.draws, dim=0)
         noise = draw(torch.randn, x.shape, rng=rng).to(x)
@@ -220,7 +220,7 @@ class AverageVelocity(LinearPath):
 
         return push
 
-    def intervals(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    def intervals(self, count: int, rng: Stream) -> tuple[Tensor, Tensor]:
         """Times r <= t (count,) of the compound loss."""
         t = self.draw_times(count, rng)
         r = t * draw(torch.rand, count, rng=rng)

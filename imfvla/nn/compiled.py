@@ -1,4 +1,4 @@
-"""`torch.compile` of the parts of a policy in which training steps and predictions spend their time.
+"""`torch.compile` of a policy: of the parts in which training steps and predictions spend their time.
 
 Context and core are compiled apart, so that the same code serves every generator and any number of evaluations. A
 generator whose loss has a derivative has it in `velocities`, which is compiled with the core in it. The encoder stays
@@ -12,9 +12,13 @@ import os
 import shutil
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+
+from imfvla.draws import Stream
+from imfvla.errors import UserError
 
 CACHE = "TORCHINDUCTOR_CACHE_DIR"  # of inductor: what it has compiled, which later processes take from there
 log = logging.getLogger(__name__)
@@ -47,15 +51,28 @@ def compile_parts(policy: nn.Module, backend: str = "inductor") -> bool:
 def compile_loss(policy: nn.Module, backend: str = "inductor") -> bool:
     """Compiles the loss of `policy` in place as one graph, which draws its random numbers from an `OwnStream`.
 
-    They are those of the code as it is written. The rest as in `compile_parts`. PyTorch refuses a loss that reads a
-    number of a tensor or calls what cannot be in a graph.
+    They are those of the code as it is written. The rest as in `compile_parts`. The compiled loss raises UserError
+    where it does what cannot be in a graph.
     """
     if not _is_ready(backend):
         return False
+    from torch._dynamo.exc import Unsupported  # here, since they take a second
     from torch._inductor import config
 
     config.fallback_random = True
-    policy.loss = torch.compile(policy.loss, backend=backend, fullgraph=True, dynamic=False)
+    compiled = torch.compile(policy.loss, backend=backend, fullgraph=True, dynamic=False)
+
+    def loss(batch: Any, rng: Stream) -> tuple[Tensor, dict[str, Tensor]]:
+        try:
+            return compiled(batch, rng)
+        except Unsupported as error:
+            reason = str(error).partition("\n")[0]
+            raise UserError(
+                f"training.compile=true makes one graph of a loss on a GPU, which this one cannot be: {reason}. Draw "
+                "random numbers by imfvla.draws.draw, read no number of a tensor, or set training.compile=false."
+            ) from error
+
+    policy.loss = loss
     return True
 
 

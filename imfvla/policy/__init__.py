@@ -14,6 +14,7 @@ from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import FRESH, GUIDED, NO_PREFIX, ROLLED, TRAINED, USUAL_NOISE, ZERO
 from imfvla.config.views import view_options
 from imfvla.data.statistics import Statistics
+from imfvla.draws import Stream
 from imfvla.errors import UserError
 from imfvla.generators.base import Generator, HasStages, draws_noise, uses_noise
 from imfvla.generators.inpainting import Inpaints, Target
@@ -76,7 +77,7 @@ class Policy(nn.Module):
         """The normalised chunks (B, Tp, A) that the generator learns, held behind an episode's end."""
         return self.chunks.normalise(hold_last(batch.actions, batch.valid), batch.obs.state[:, -1])
 
-    def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, batch: Batch, rng: Stream) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean loss over the batch, a scalar, and scalars to log. Steps that are not valid do not count."""
         actions, valid, tokens = self.targets(batch), batch.valid, self.encoder(batch.obs)
         if self.prefix is None:

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from imfvla.draws import draw
+from imfvla.draws import Stream, draw
 from imfvla.nn.dual import Dual, Same
 
 
@@ -44,7 +44,7 @@ class PrefixInput(nn.Module):
             nn.Linear(most * (channels + 1), width), nn.SiLU(), nn.Linear(width, width)
         )
 
-    def draw(self, batch: int, rng: torch.Generator) -> Tensor:
+    def draw(self, batch: int, rng: Stream) -> Tensor:
         """How many actions are given in each of a batch of chunks (B,): 0 to `most`, all equally often."""
         return draw(torch.randint, self.most + 1, (batch,), rng=rng)
 

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Compiling:
-    """Compiles the parts of `policy` at once, never, or as soon as auto decides so.
+    """Compiles the parts of `policy`, or on a GPU its whole loss, at once, never, or as soon as auto decides so.
 
     `decided` is what the state of an earlier process says for auto: one of MODES, or None.
     """
@@ -51,15 +51,11 @@ class Compiling:
         self._can_be_one_graph = (
             device.type == ONE_GRAPH_ON and processes.size == 1 and options.accumulate == 1
         )
+        self.is_one_graph = False  # the loss is compiled as a whole, and draws from an `OwnStream`
         self._times: list[float] = []  # of steps before the decision [s]
         self._lines: _Lines | None = None
         if self.mode == COMPILED:
             self._compile()
-
-    @property
-    def is_one_graph(self) -> bool:
-        """Whether the loss is compiled as a whole, and draws from an `OwnStream`."""
-        return self.mode == COMPILED and self._can_be_one_graph
 
     def took(self, seconds: float, step: int) -> None:
         """Takes the time of step `step` (from 1); step `DECIDED_AT` decides."""
@@ -80,8 +76,11 @@ class Compiling:
             self._lines.close()
 
     def _compile(self) -> None:
-        compile_it = compile_loss if self.is_one_graph else compile_parts
-        if compile_it(self.policy) and self.processes.is_first:
+        compile_it = compile_loss if self._can_be_one_graph else compile_parts
+        if not compile_it(self.policy):
+            return
+        self.is_one_graph = self._can_be_one_graph
+        if self.processes.is_first:
             self._lines = _Lines()
 
 

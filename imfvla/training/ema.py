@@ -29,7 +29,7 @@ class Ema:
 
     @torch.no_grad()
     def update(self, step: int) -> None:
-        """Averages in the weights after update `step` (0-based)."""
+        """Averages in the weights after step `step` (0-based), also where they have not changed in it."""
         pairs = list(zip(self.policy.parameters(), self._source.parameters(), self._spans, strict=True))
         for span in set(self._spans):
             first, end = span

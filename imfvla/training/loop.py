@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from imfvla.draws import Stream
 from imfvla.errors import UserError
 from imfvla.process.progress import Progress
 from imfvla.process.signals import Stopped, deferred_stop
@@ -50,7 +51,7 @@ class Trainable(Protocol):
 
     def spans(self, steps: int) -> Spans: ...
     def begin_step(self, step: int, steps: int) -> None: ...
-    def loss(self, batch: Batch, rng: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]: ...
+    def loss(self, batch: Batch, rng: Stream) -> tuple[Tensor, dict[str, Tensor]]: ...
 
 
 class Batches(Protocol):
@@ -122,6 +123,8 @@ class Trainer:
         self.clipping = Clipping(optim.clip_factor, optim.clip_norm, gradient_scale, self.device)
         self.non_finite = NonFinite(options.on_non_finite)
         self._goes_on = torch.ones((), dtype=torch.bool, device=self.device)
+        self._boundaries = {step for span in spans.values() for step in span}
+        self._loss: float | None = None  # as last read
         self.compiling = Compiling(options, self.policy, self.device, self.processes, compiling)
 
     @property
@@ -156,21 +159,23 @@ class Trainer:
         keep_weights = self.options.checkpoint_steps()
         start = interval_start = last_save = time.perf_counter()
         spent_before, first_step, interval_step, waited = self.train_s, self.step, self.step, 0.0
-        loss = math.nan  # as last read
         while not self.is_finished:
             before = time.perf_counter()
             batch = next(self.batches)
             received = time.perf_counter()
             waited += received - before
+            if self.step in self._boundaries:
+                self._read(logger)  # with the weights of the stage that ends
             self._update(batch)
             self.compiling.took(time.perf_counter() - received, self.step)
             row_is_due = self.step % self.options.log_every == 0 or self.is_finished
             if row_is_due:
-                loss = self._read(logger)
+                self._read(logger)
             now = time.perf_counter()
             self.train_s = spent_before + now - start
             rate = (self.step - first_step) / (now - start)
-            progress.advance(f"loss {loss:.4f}  {rate:.2f} steps/s")
+            loss = "" if self._loss is None else f"loss {self._loss:.4f}  "
+            progress.advance(f"{loss}{rate:.2f} steps/s")
             if row_is_due:
                 seconds = now - interval_start
                 rate = (self.step - interval_step) / seconds
@@ -192,7 +197,10 @@ class Trainer:
                 raise Stopped(stop)
 
     def _update(self, batch: Batch | Sent) -> None:
-        """One step of the optimiser over all processes; none where loss or gradient is not finite."""
+        """One step of the optimiser over all processes.
+
+        None where loss or gradient is not finite; where that is to stop the training, none after it either.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate(group["span"])
         self.ema.settle(self.step)
@@ -216,7 +224,7 @@ class Trainer:
         loss, *means = self.processes.mean(exact)
         takes_part = self._goes_on & loss.isfinite() & norm.isfinite()
         if self.non_finite.stops:
-            self._goes_on = takes_part  # the weights stay those that such a batch was found with
+            self._goes_on = takes_part  # until it is read, the weights stay those that it was found with
         clipped = self.clipping.clip(gradients, norm, takes_part)
         self.optimiser.found_inf = (~takes_part).to(torch.float32)  # decides on the device whether it steps
         self.optimiser.step()
@@ -226,14 +234,14 @@ class Trainer:
         self.unread.add(self.step, measured | dict(zip(logs, means, strict=True)))
         self.step += 1
 
-    def _read(self, logger: MetricsLogger) -> float:
-        """Logs what the steps since the last reading measured; returns the last loss.
+    def _read(self, logger: MetricsLogger) -> None:
+        """Logs what the steps since the last reading measured, all of one stage.
 
-        Nothing else waits for a GPU. Raises UserError where a batch that is not finite is to stop the training.
+        Of what happens in every step or row nothing else waits for a GPU. Raises UserError where a batch that is not
+        finite is to stop the training.
         """
-        loss = math.nan
         for step, scalars in self.unread.read():
-            loss = scalars["loss"]
+            self._loss = scalars["loss"]
             for what, name in (("loss", "loss"), ("norm of the gradient", "grad_norm")):
                 if not math.isfinite(scalars[name]):
                     self._skipped(step, what, scalars[name])
@@ -242,7 +250,6 @@ class Trainer:
             else:
                 self.non_finite.in_a_row = 0
                 logger.add(scalars)
-        return loss
 
     def _rate(self, span: Span) -> float:
         """The learning rate of this step for parameters that learn in the steps of `span`; 0 in others."""
@@ -259,7 +266,6 @@ class Trainer:
 
     def _skipped(self, step: int, what: str, value: float) -> None:
         """Says what step `step` did not learn from. Raises UserError where training is to stop."""
-        self.policy.begin_step(step, self.options.steps)
         batch = self.batches.batch(step).to(self.device)
         cause = name_cause(self.policy, batch, step_seed(self.seed, step), self.batches.describe(step))
         kept = (

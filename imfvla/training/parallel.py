@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.overrides import TorchFunctionMode
 
+from imfvla.draws import Stream
 from imfvla.errors import UserError
 from imfvla.training.options import NONE, TrainingOptions
 from imfvla.training.sharding import forget_layouts, is_part
@@ -60,9 +61,7 @@ class Alone:
         count = total // self.size
         return slice(self.rank * count, (self.rank + 1) * count)
 
-    def draws(
-        self, rng: torch.Generator, count: int, part: int = 0, parts: int = 1
-    ) -> AbstractContextManager[Any]:
+    def draws(self, rng: Stream, count: int, part: int = 0, parts: int = 1) -> AbstractContextManager[Any]:
         """Context in which the loss of `count` rows uses the whole batch's random numbers for these rows.
 
         They are part `part` of the `parts` equal ones of this process's rows.

@@ -1,10 +1,12 @@
 import copy
 import os
+from types import SimpleNamespace
 
 import pytest
 import torch
 from small_policy import batch, config, loss, policy
 
+from imfvla.errors import UserError
 from imfvla.nn import compiled
 
 
@@ -68,3 +70,10 @@ def test_compiled_code_lies_in_the_users_cache_unless_the_user_says_where(monkey
     monkeypatch.delenv(compiled.CACHE)
     compiled.compile_parts(policy())
     assert os.environ[compiled.CACHE] == str(tmp_path / "imfvla" / "inductor")
+
+
+def test_a_loss_that_is_no_graph_is_refused_with_what_to_do():
+    made = SimpleNamespace(loss=lambda batch, rng: (batch + torch.randn(3, generator=rng), {}))
+    assert compiled.compile_loss(made, backend="eager")
+    with pytest.raises(UserError, match=r"one graph .* cannot be: .* imfvla\.draws\.draw, .*compile=false"):
+        made.loss(torch.ones(3), torch.Generator())

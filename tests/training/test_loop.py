@@ -309,6 +309,59 @@ def test_a_batch_that_is_not_finite_is_left_out_where_that_is_configured(tmp_pat
     assert "Skipped at step 3, batch 2: the loss is nan" in caplog.text
 
 
+class BadBatch(CountedBatches):
+    """A row of batch `bad` is not finite."""
+
+    def __init__(self, bad: int) -> None:
+        super().__init__()
+        self.bad = bad
+
+    def batch(self, number):
+        batch = super().batch(number)
+        if number == self.bad:
+            batch.actions[5, 0, 0] = torch.inf
+        return batch
+
+
+LATE = {
+    "steps": 8,
+    "save_every_s": 1e9,
+    "checkpoints": 1,
+}  # only rows of the log, and stages, read what was measured
+
+
+@pytest.mark.parametrize("bad", [0, 2, 3, 4, 6])  # the second stage begins at step 4
+def test_a_bad_batch_is_named_at_the_next_row_with_the_weights_that_it_was_found_with(
+    tmp_path, make_trainer, bad
+):
+    sound = make_trainer(tmp_path / "sound", StagedPolicy(), **LATE, log_every=8)
+    for _ in range(bad):
+        sound._update(next(sound.batches))
+    found = make_trainer(tmp_path / "found", StagedPolicy(), **LATE, log_every=8)
+    found.batches = BadBatch(bad)
+    where = rf"step {bad + 1}, batch {bad}: .* It comes from batch-{bad}\.mcap, step 5\. Lower"
+    with pytest.raises(UserError, match=where):
+        found.train()
+    assert found.step == (4 if bad < 4 else 8)
+    if bad != 4:  # where the blocks of the second stage begin with the weights of the first
+        for own, expected in zip(found.policy.parameters(), sound.policy.parameters(), strict=True):
+            assert torch.equal(own, expected)
+
+
+@pytest.mark.parametrize("bad", [0, 2, 3, 4, 6, 7])
+def test_when_a_skipped_batch_is_noticed_changes_nothing(tmp_path, make_trainer, bad):
+    trained = []
+    for log_every in (1, 8):
+        trainer = make_trainer(
+            tmp_path / str(log_every), StagedPolicy(), **LATE, log_every=log_every, on_non_finite="skip"
+        )
+        trainer.batches = BadBatch(bad)
+        trainer.train()
+        assert sum(row.get("skipped", 0) for row in read_metrics(trainer.run.metrics)) == 1
+        trained.append([*trainer.policy.parameters(), *trainer.ema.policy.parameters()])
+    assert all(torch.equal(*pair) for pair in zip(*trained, strict=True))
+
+
 def test_too_many_skipped_batches_in_a_row_stop_the_run(tmp_path, make_trainer):
     class Hopeless(TinyPolicy):
         def loss(self, batch, rng):
