@@ -144,25 +144,30 @@ def _sentence(method: str, measured: Sequence[Changed]) -> str:
 
 def _side_by_side(names: Mapping[str, str], found: Sequence[Changed]) -> list[str]:
     """What is said of methods of which a worker plays several episodes at a time."""
-    sizes = {
-        one.usual.row.label: size for one in found if (size := dict(one.result.row.changes).get("batch"))
-    }
+    sizes: dict[str, list[int]] = {}
+    for one in found:
+        sizes.setdefault(one.usual.row.label, []).append(dict(one.result.row.changes).get("batch", 1))
     return [
-        f"{names[method]}: {size} episodes side by side, which changes the rounding of a chunk alone."
-        for method, size in sizes.items()
+        f"{names[method]}: {max(of_method)} episodes side by side in {sum(size > 1 for size in of_method)} of "
+        f"{len(of_method)} settings, which changes the rounding of a chunk alone."
+        for method, of_method in sizes.items()
+        if max(of_method) > 1
     ]
 
 
 def _events(results: Sequence[Result]) -> list[str]:
-    """For each setting whose condition is an event, in how many episodes it came."""
-    counts: dict[str, list[list[int]]] = {}
+    """In how many episodes the event of each setting came, of all rows; in one sentence where it came in all."""
+    counts: dict[str, tuple[int, int]] = {}
     for result in results:
         if _has_event(result):
-            counts.setdefault(world(result.row.changes), []).append(condition_happened(result.episodes))
-    return [
-        f"{text}: the event came in {sum(came for came, _ in told)} of {sum(every for _, every in told)} episodes of "
-        "all rows."
-        for text, told in counts.items()
+            text = world(result.row.changes)
+            pair = zip(counts.get(text, (0, 0)), condition_happened(result.episodes), strict=True)
+            counts[text] = tuple(map(sum, pair))
+    always = [text for text, (came, every) in counts.items() if came == every]
+    return [f"The event came in every episode of: {'; '.join(always)}."] * bool(always) + [
+        f"{text}: the event came in {came} of {every} episodes of all rows."
+        for text, (came, every) in counts.items()
+        if came < every
     ]
 
 

@@ -137,7 +137,9 @@ def test_a_method_that_is_played_side_by_side_has_the_lines_of_the_others(tmp_pa
     ]
     document = settings_table(TABLE, found)
     assert [line[0] for line in document.shown.rows] == ["unchanged", "bump 2"]
-    assert "L1 regression: 8 episodes side by side, which" in " ".join(document.shown.notes)
+    assert "L1 regression: 8 episodes side by side in 1 of 1 settings, which" in " ".join(
+        document.shown.notes
+    )
     assert [line["setting"] for line in csv.DictReader(io.StringIO(document.data.csv()))][2:] == [
         "bump 2",
         "bump 2, batch 8",
@@ -167,9 +169,16 @@ def test_whether_an_event_came_is_counted(tmp_path):
     assert any(
         note.startswith("bump 2: the event came in 97 of 100 episodes") for note in document.shown.notes
     )
+    assert "every episode" not in " ".join(document.shown.notes)
     lines = list(csv.DictReader(io.StringIO(document.data.csv())))
     assert lines[-1]["condition_happened"] == "97"
     assert lines[0]["condition_happened"] == ""
+
+
+def test_events_that_always_came_are_one_sentence(tmp_path):
+    told = Result.of(answered_bump(tmp_path, [True] * 100))
+    document = settings_table(TABLE, [*(Result.of(answer) for answer in unchanged(tmp_path)), told])
+    assert "The event came in every episode of: bump 2." in document.shown.notes
 
 
 def unchanged(root):
