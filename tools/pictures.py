@@ -44,6 +44,7 @@ FIGURES = {  # picture -> figure of imfvla.report
     "reward_latency": "figure3_reward_latency",
     "success_by_cost": "success_by_cost_dwell",
     "success_by_delay": "success_by_delay_table4",
+    "success_by_severity": "success_by_severity_table5",
 }
 MOMENTS = 6  # of a rollout, start and end among them
 STEPS = [round(share * TIME_LIMIT_STEPS) for share in np.linspace(0, 1, MOMENTS)]

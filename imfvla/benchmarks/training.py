@@ -107,7 +107,9 @@ def _step(trainer: Trainer, batches: Iterator[Batch], spent: dict[str, float]) -
     with _timed(spent, "backward"):
         loss.backward()
     with _timed(spent, "optimiser"):
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), trainer.clipping.limit)
+        gradients = [p.grad for p in policy.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        trainer.clipping.clip(gradients, norm, norm.isfinite())
         trainer.optimiser.step()
         trainer.optimiser.zero_grad(set_to_none=True)
         trainer.ema.update(trainer.step)
