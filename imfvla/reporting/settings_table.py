@@ -46,7 +46,7 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
         if result.row.table == table.name:
             changes = result.row.changes
             base = next(name for name in table.rows if result.name == name_of(table.name, name, changes))
-            found.append(_compared(result, named[base]))
+            found.append(_compared(result, _of_the_same_seeds(named[base], result)))
     corrected = holm([one.success.p if one.success else None for one in found])
     return [replace(one, p_holm=p) for one, p in zip(found, corrected, strict=True)]
 
@@ -84,6 +84,13 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     shown = Table(table.title, columns, tuple(rows), notes, commands=commands, cell_keys=tuple(keys))
     data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
     return Document(shown, Table(table.title, COLUMNS, tuple(data)))
+
+
+def _of_the_same_seeds(usual: Result, result: Result) -> Result:
+    """The unchanged row of the training seeds that were played in the setting: other weights are no pairs of these."""
+    seeds = {found.evaluation.training_seed for found in result.evaluated}
+    kept = [found for found in usual.evaluated if found.evaluation.training_seed in seeds]
+    return Result(kept, usual.answer) if kept else usual
 
 
 def _compared(result: Result, usual: Result) -> Changed:

@@ -175,6 +175,20 @@ def test_whether_an_event_came_is_counted(tmp_path):
     assert lines[0]["condition_happened"] == ""
 
 
+def test_only_training_seeds_that_were_played_in_a_setting_are_compared(tmp_path):
+    for seed in (0, 1):
+        answer_row(tmp_path, BY_NAME[BASES[0]], seed=seed, quality=0.9 - 0.5 * seed)
+    answer_row(tmp_path, BY_NAME[BASES[0]], quality=0.9, **RUNNING)
+    sources = Sources([tmp_path])
+    (late,) = rows({key: RUNNING[key] for key in ("clock", "delay_ms", "meanwhile")} | {"rows": [BASES[0]]})
+    found = [Result.of(sources.answer(row, MAPPING)) for row in (*(BY_NAME[name] for name in BASES), late)]
+    assert len(found[0].episodes) == 200
+    unchanged, delayed = settings_table(TABLE, found).shown.rows
+    count = sum(row["success"] for row in found[2].episodes)
+    assert unchanged[1].startswith(f"{count}/100")
+    assert delayed[1].startswith(f"{count}/100 (+0)")
+
+
 def test_events_that_always_came_are_one_sentence(tmp_path):
     told = Result.of(answered_bump(tmp_path, [True] * 100))
     document = settings_table(TABLE, [*(Result.of(answer) for answer in unchanged(tmp_path)), told])
