@@ -282,7 +282,7 @@ def tables_of(found: Mapping[str, Any], effort: Effort) -> list[Table]:
     return [
         Table(title, ("form, precision", "steps/s", "ms a step", "MiB at most"), training),
         Table("A chunk at batch 1, numpy to numpy [ms]", ("experiment", "sampler", "median", "p95"), latency),
-        speed_table(found["ratios"]),
+        *([speed_table(found["ratios"])] if found["ratios"] else []),
         Table(f"Losses, limit {TOLERANCE}", ("step", "device", "cpu", "difference"), losses),
         Table("Relative errors against float64", ("precision", "u", "du/dt", "u + (t - r) du/dt"), errors),
     ]
