@@ -133,8 +133,8 @@ def describe(config: Mapping[str, Any]) -> Method:
         residual=_name(residual, RESIDUAL) if residual else STANDARD,
         block_size=residual.get("block_size", 1),
         readout=residual.get("readout", "sum"),
-        generator_class=_class(generator),
-        generator=generator_name(_class(generator), generator.get("power")),
+        generator_class=class_of(generator),
+        generator=generator_name(class_of(generator), generator.get("power")),
         parametrisation=generator.get("parametrisation"),
         times=_name(times, TIMES) if times else None,
         boundary_share=generator.get("boundary_share"),
@@ -150,7 +150,7 @@ def describe(config: Mapping[str, Any]) -> Method:
 
 def sublayers_of(core: Mapping[str, Any]) -> tuple[str, ...]:
     """What a block of a configured core is made of."""
-    return SUBLAYERS.get(_class(core), TWO_SUBLAYERS)
+    return SUBLAYERS.get(class_of(core), TWO_SUBLAYERS)
 
 
 def generator_name(cls: str, power: object = None) -> str:
@@ -175,9 +175,10 @@ def _is_joint(channel: str) -> bool:
     return unit_of(channel) == "rad" or bare_name(channel).rpartition("/")[2] == "gripper"
 
 
-def _class(part: Mapping[str, Any]) -> str:
+def class_of(part: Mapping[str, Any]) -> str:
+    """The name of the class that a part of a config is built from."""
     return str(part.get("_target_", "")).rpartition(".")[2]
 
 
 def _name(part: Mapping[str, Any], names: Mapping[str, str]) -> str:
-    return names.get(_class(part), _class(part))
+    return names.get(class_of(part), class_of(part))

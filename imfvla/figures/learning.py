@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from imfvla.figures.description import generator_name
+from imfvla.figures.description import class_of, generator_name
 from imfvla.figures.names import training_of
 from imfvla.figures.panels import look, panels_of, plain_log_ticks, say_nothing_yet
 from imfvla.figures.style import WIDTH, new_figure, style
@@ -98,9 +98,9 @@ def _kind(evaluation: Evaluation) -> dict[str, Any]:
     """The generator, and those of its options that the unit of the loss depends on."""
     generator = evaluation.config.get("generator", {})
     units = {key: generator[key] for key in UNITS if key in generator}
-    if _class(generator) == "Regression":
+    if class_of(generator) == "Regression":
         units.setdefault("power", 1)  # configs from before there was L2 do not say it
-    return {"class": _class(generator), **units}
+    return {"class": class_of(generator), **units}
 
 
 def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -110,14 +110,10 @@ def _titles(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
         rivals = [other for other in kinds if other["class"] == kind["class"] and other != kind]
         unit = next((key for key in UNITS if any(other.get(key) != kind.get(key) for other in rivals)), None)
         value = kind.get(unit)
-        detail = OUTPUTS.get(str(value), f"{unit} {_class(value) if isinstance(value, dict) else value}")
+        detail = OUTPUTS.get(str(value), f"{unit} {class_of(value) if isinstance(value, dict) else value}")
         name = generator_name(kind["class"], kind.get("power")) or "training loss"
         titles.append(f"{name}, {detail}" if unit not in (None, "power") else name)
     return [f"{title} ({n})" if titles.count(title) > 1 else title for n, title in enumerate(titles, 1)]
-
-
-def _class(part: Mapping[str, Any]) -> str:
-    return str(part.get("_target_", "")).rpartition(".")[2]
 
 
 def _name(evaluation: Evaluation) -> str:

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
+from imfvla.figures.description import class_of
 from imfvla.figures.style import CYCLE, GREY, MARKERS
 from imfvla.reporting.mapping import Mapping, read_mapping
 from imfvla.reporting.results import Result
@@ -91,7 +92,7 @@ NUMBERS = {
 
 def numbers(results: Sequence[Result]) -> list[int]:
     """A number for each result, of another method each: that of its generator, else the lowest that is left."""
-    usual = [NUMBERS.get(_generator(result)) for result in results]
+    usual = [NUMBERS.get(class_of(result.first.config.get("generator", {}))) for result in results]
     left = (number for number in count() if number not in usual)
     taken: set[int] = set()
     found = []
@@ -100,11 +101,6 @@ def numbers(results: Sequence[Result]) -> list[int]:
         taken.add(own)
         found.append(own)
     return found
-
-
-def _generator(result: Result) -> str:
-    """The class of its generator."""
-    return str(result.first.config.get("generator", {}).get("_target_", "")).rpartition(".")[2]
 
 
 def look(number: int) -> dict[str, str]:
