@@ -1,4 +1,4 @@
-"""A table of settings: success in each, and what it loses against the unchanged world, start by start."""
+"""A table of settings: success in each, and what it loses against the unchanged row, start by start."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """A row in a setting against the same row in the unchanged world."""
+    """A row in a setting against the same row unchanged."""
 
     result: Result
     usual: Result
@@ -65,8 +65,8 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     keys = [tuple(usual), *(tuple(one.result.name if one else "" for one in line) for line in lines)]
     measured = [one for one in found if one.success]
     notes = [
-        "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
-        f"from the same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
+        "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from the "
+        f"same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
         f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
         *(
@@ -79,7 +79,7 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     ]
     is_missing = any(one.result.is_missing or one.usual.is_missing for one in found)
     commands = ((table.name, f"python -m imfvla.train -m +sweep={table.sweep}"),) if is_missing else ()
-    columns = ("World", *(names[result.row.label] for result in usual.values()))
+    columns = ("Setting", *(names[result.row.label] for result in usual.values()))
     notes = tuple(note for note in notes if note)
     shown = Table(table.title, columns, tuple(rows), notes, commands=commands, cell_keys=tuple(keys))
     data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
@@ -139,7 +139,7 @@ def _sentence(method: str, measured: Sequence[Changed]) -> str:
         if one.p_holm is not None and one.p_holm < ALPHA and one.success.result.value < 0
     ]
     told = (
-        f"fewer successes than in the unchanged world in {len(lost)} of {len(measured)} settings"
+        f"fewer successes than in the first line in {len(lost)} of {len(measured)} settings"
         if lost
         else f"no setting of {len(measured)} in which fewer successes are told from chance"
     )
