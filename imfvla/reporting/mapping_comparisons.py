@@ -42,11 +42,11 @@ class _ComparisonEntry:
 def read_comparisons(
     content: dict[str, Any], tables: Sequence[TableTitle], rows: Sequence[TableRow], path: Path
 ) -> tuple[Comparison, ...]:
-    """Those of all tables of comparisons. `rows` are all rows, of settings too, which none may compare.
+    """Those of all tables of comparisons, of `rows`, which may be those of settings.
 
     Raises UserError naming file, line and row for a wrong one.
     """
-    by_name = {row.name: row for row in rows if not row.changes}
+    by_name = {row.name: row for row in rows}
     comparisons: list[Comparison] = []
     for table in tables:
         if table.of == COMPARISONS:
@@ -77,9 +77,14 @@ def _comparison(
         paper = named(read.paper, labels, f"{where}: unknown row of the paper's Table {table.printed}")
     return Comparison(
         table=table.name,
-        row=named(read.row, rows, f"{where}: unknown row"),
-        baseline=named(read.baseline, rows, f"{where}: unknown row"),
+        row=_row(read.row, rows, where),
+        baseline=_row(read.baseline, rows, where),
         of=read.of,
         operation=read.operation,
         paper=paper,
     )
+
+
+def _row(name: str, rows: dict[str, TableRow], where: str) -> TableRow:
+    usual = {usual: row for usual, row in rows.items() if not row.changes}  # the message names these alone
+    return rows[name] if name in rows else named(name, usual, f"{where}: unknown row")

@@ -65,8 +65,8 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     keys = [tuple(usual), *(tuple(one.result.name if one else "" for one in line) for line in lines)]
     measured = [one for one in found if one.success]
     notes = [
-        "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from the "
-        f"same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
+        "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from "
+        f"the same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
         f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
         *(

@@ -20,6 +20,7 @@ from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.mapping_row import TableRow
 from imfvla.reporting.media import Media
+from imfvla.reporting.notes import label as comparison_label
 from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
 from imfvla.reporting.settings import label, rows_of_settings, short_labels
@@ -71,7 +72,11 @@ def test_wrong_settings_are_named(entry, message):
 def fills(job: list[str], row: TableRow) -> bool:
     """Whether a job of a sweep makes the row's evaluation, whatever its training seeds."""
     given = dict(override.split("=", 1) for override in job)
-    asked = [f"+exp={row.experiment}", *row.overrides, *(f"evaluation.{key}={value}" for key, value in row.changes)]
+    asked = [
+        f"+exp={row.experiment}",
+        *row.overrides,
+        *(f"evaluation.{key}={value}" for key, value in row.changes),
+    ]
     return set(asked) <= set(job) and row.nfe in yaml.safe_load(given["evaluation.nfe"])
 
 
@@ -84,6 +89,15 @@ def test_every_table_of_settings_is_filled_by_its_sweep():
     jobs = jobs_of_rows(MAPPING.of_table("table4"))
     assert all("evaluation.clock=running" in job or "condition=bump" in job for job in jobs)
     assert len(jobs) == len(set(jobs))
+
+
+def test_a_row_in_a_setting_is_compared_under_the_setting_s_name():
+    same, *_, with_l1 = MAPPING.of_comparisons("transfer_zero_compared")
+    assert with_l1.row.changes == (("noise", "zero"),)
+    assert comparison_label(with_l1).startswith(
+        "iMF-AttnRes, two stages (infer1, zero noise) vs L1 regression"
+    )
+    assert "zero noise" not in comparison_label(same)
 
 
 @pytest.fixture
