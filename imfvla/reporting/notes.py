@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from imfvla.reporting import settings
 from imfvla.reporting.cells import BY_NAME
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping_comparisons import Comparison
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
+from imfvla.reporting.mapping import settings
+from imfvla.reporting.mapping.comparisons import Comparison
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.statistics.power import ALPHA, POWER, detectable_share_difference
 
 
 def detectable_success(pairs: int) -> str:

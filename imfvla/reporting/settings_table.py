@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
-from imfvla.reporting.mapping_tables import TableTitle
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.mapping.settings import label, name_of, short_labels, world
+from imfvla.reporting.mapping.tables import TableTitle
 from imfvla.reporting.metrics import condition_happened
-from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, name_of, short_labels, world
-from imfvla.reporting.significance import holm
+from imfvla.reporting.statistics.contrasts import Contrast, return_difference, success_difference
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.pairs import Pairs, refusal
+from imfvla.reporting.statistics.significance import holm
 from imfvla.reporting.table import MISSING, REFUSED, Table, interval
 from imfvla.reporting.tables import Document
 

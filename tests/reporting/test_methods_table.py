@@ -11,7 +11,7 @@ from synthetic_runs import answer_row
 from imfvla.errors import UserError
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import PATH, read_mapping
-from imfvla.reporting.mapping_methods import MethodEntry
+from imfvla.reporting.mapping.methods import MethodEntry
 from imfvla.reporting.methods_table import methods_table
 from imfvla.reporting.results import Result
 

@@ -18,12 +18,12 @@ from imfvla.errors import UserError
 from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.settings import label, rows_of_settings, short_labels
 from imfvla.reporting.media import Media
 from imfvla.reporting.notes import label as comparison_label
 from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, rows_of_settings, short_labels
 from imfvla.reporting.settings_table import settings_table
 
 MAPPING = read_mapping()

@@ -6,7 +6,7 @@ import io
 import pytest
 from rich.console import Console
 
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.statistics.measured import Measured
 from imfvla.reporting.table import FILL, Table, interval, number, with_interval
 
 TABLE = Table(

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imfvla.reporting.power import detectable_difference, detectable_share_difference, mcnemar_power
-from imfvla.reporting.significance import mcnemar
+from imfvla.reporting.statistics.power import (
+    detectable_difference,
+    detectable_share_difference,
+    mcnemar_power,
+)
+from imfvla.reporting.statistics.significance import mcnemar
 
 
 @pytest.mark.parametrize(("pairs", "disagreement"), [(20, 0.5), (100, 0.5), (100, 0.15), (1000, 0.3)])

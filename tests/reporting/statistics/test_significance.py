@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imfvla.reporting import significance
-from imfvla.reporting.significance import holm, mcnemar, sign_flip, signed_rank
+from imfvla.reporting.statistics import significance
+from imfvla.reporting.statistics.significance import holm, mcnemar, sign_flip, signed_rank
 
 
 def outcomes(only_ours: int, only_theirs: int, both: int = 5) -> tuple[np.ndarray, np.ndarray]:

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from synthetic_runs import make_run, write_evaluation
 
-from imfvla.reporting import estimates
 from imfvla.reporting.answers import Evaluated
-from imfvla.reporting.contrasts import return_difference, return_ratio, speedup, success_difference
 from imfvla.reporting.episodes import read_episodes
 from imfvla.reporting.metrics import summarise
-from imfvla.reporting.pairs import Pairs
 from imfvla.reporting.runs import evaluations
-from imfvla.reporting.significance import mcnemar, sign_flip
+from imfvla.reporting.statistics import estimates
+from imfvla.reporting.statistics.contrasts import return_difference, return_ratio, speedup, success_difference
+from imfvla.reporting.statistics.pairs import Pairs
+from imfvla.reporting.statistics.significance import mcnemar, sign_flip
 from imfvla.storage.run_directory import RunDirectory
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from imfvla.errors import UserError
 from imfvla.options import build, require
-from imfvla.reporting.mapping_file import entries, named, place_of, plain
-from imfvla.reporting.mapping_row import TableRow, Wanted
-from imfvla.reporting.mapping_tables import ROWS, SETTINGS, TableTitle, check_each_once
+from imfvla.reporting.mapping.file import entries, named, place_of, plain
+from imfvla.reporting.mapping.row import TableRow, Wanted
+from imfvla.reporting.mapping.settings import rows_of_settings
+from imfvla.reporting.mapping.tables import ROWS, SETTINGS, TableTitle, check_each_once
 from imfvla.reporting.paper import paper_rows
-from imfvla.reporting.settings import rows_of_settings
 from imfvla.storage.run_directory import LAST
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imfvla.reporting import estimates
-from imfvla.reporting.estimates import wilson_interval
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.statistics import estimates
+from imfvla.reporting.statistics.estimates import wilson_interval
+from imfvla.reporting.statistics.measured import Measured
 
 VALUES = np.array([0.0, 0.0, 10.0, 40.0, 50.0, 70.0, 90.0, 2000.0])
 

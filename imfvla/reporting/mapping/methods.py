@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from imfvla.options import DIFFERENT, build, require, within_length
-from imfvla.reporting.mapping_file import entries, named, place_of, plain
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.mapping_tables import METHODS, TableTitle
+from imfvla.reporting.mapping.file import entries, named, place_of, plain
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.tables import METHODS, TableTitle
 
 
 @dataclass(frozen=True, slots=True)

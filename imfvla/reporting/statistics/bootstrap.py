@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 import scipy
 
-from imfvla.reporting.measured import Measured
-from imfvla.reporting.resampling import (
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.resampling import (
     Columns,
     Draws,
     Statistic,

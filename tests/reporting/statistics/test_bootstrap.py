@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imfvla.reporting import bootstrap as module
-from imfvla.reporting import resampling
-from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
-from imfvla.reporting.estimates import INTERQUARTILE_MEAN, MEAN, MEDIAN
-from imfvla.reporting.resampling import OfMeans
+from imfvla.reporting.statistics import bootstrap as module
+from imfvla.reporting.statistics import resampling
+from imfvla.reporting.statistics.bootstrap import Bootstrapped, bootstrap
+from imfvla.reporting.statistics.estimates import INTERQUARTILE_MEAN, MEAN, MEDIAN
+from imfvla.reporting.statistics.resampling import OfMeans
 
 SKEWED = np.array([10, 12, 12.5, 12.5, 13.9, 15, 21, 22, 23, 34, 50, 81, 89, 121, 134, 213])
 

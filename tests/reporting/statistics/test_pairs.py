@@ -9,8 +9,8 @@ from synthetic_runs import MACHINE, make_run, write_evaluation
 
 from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.episodes import read_episodes
-from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.runs import evaluations
+from imfvla.reporting.statistics.pairs import Pairs, refusal
 from imfvla.storage.run_directory import RunDirectory
 
 

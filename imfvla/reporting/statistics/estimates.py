@@ -8,9 +8,9 @@ import math
 import numpy as np
 import scipy
 
-from imfvla.reporting.bootstrap import TAILS, bootstrap
-from imfvla.reporting.measured import Measured
-from imfvla.reporting.resampling import OfMeans, OfOrdered, Statistic, middle, trimmed
+from imfvla.reporting.statistics.bootstrap import TAILS, bootstrap
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.resampling import OfMeans, OfOrdered, Statistic, middle, trimmed
 
 FEWEST_TRAININGS = 3  # that an interval of times is over
 

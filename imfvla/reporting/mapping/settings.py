@@ -13,8 +13,8 @@ from typing import Any
 
 from imfvla.config.protocol import USUAL, EvaluationOptions, unusual
 from imfvla.options import build, require
-from imfvla.reporting.mapping_file import named, place_of, plain
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.file import named, place_of, plain
+from imfvla.reporting.mapping.row import TableRow
 
 OF_CONDITION = {"condition": "name", "severity": "severity"}  # keys of an entry that are keys of `condition`
 KEYS = (

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from imfvla.errors import UserError
 from imfvla.options import Limit, build, one_of, require, suggestion
-from imfvla.reporting.mapping_file import named, place_of, plain
+from imfvla.reporting.mapping.file import named, place_of, plain
 from imfvla.reporting.paper import paper_numbers
 
 ROWS, COMPARISONS, SETTINGS, METHODS = "rows", "comparisons", "settings", "methods"

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from imfvla.options import build, require
-from imfvla.reporting.mapping_file import entries, named, place_of, plain
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.mapping_tables import COMPARISONS, TableTitle, check_each_once
+from imfvla.reporting.mapping.file import entries, named, place_of, plain
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.tables import COMPARISONS, TableTitle, check_each_once
 from imfvla.reporting.paper import PaperComparison, paper_comparisons
 
 OPERATIONS = ("ratio", "inverse_ratio", "difference")

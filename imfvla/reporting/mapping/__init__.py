@@ -5,12 +5,12 @@ from functools import cache
 from pathlib import Path
 
 from imfvla.config.assets import folder
-from imfvla.reporting.mapping_comparisons import Comparison, read_comparisons
-from imfvla.reporting.mapping_file import load
-from imfvla.reporting.mapping_methods import MethodEntry, read_methods
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.mapping_rows import read_rows
-from imfvla.reporting.mapping_tables import ROWS, SETTINGS, TableTitle, TaskTitle, read_titles
+from imfvla.reporting.mapping.comparisons import Comparison, read_comparisons
+from imfvla.reporting.mapping.file import load
+from imfvla.reporting.mapping.methods import MethodEntry, read_methods
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.rows import read_rows
+from imfvla.reporting.mapping.tables import ROWS, SETTINGS, TableTitle, TaskTitle, read_titles
 
 PATH = folder("experiments") / "tables.yaml"
 

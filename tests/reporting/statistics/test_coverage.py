@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imfvla.reporting import bootstrap, estimates
+from imfvla.reporting.statistics import bootstrap, estimates
 
 DRAWS, EPISODES = 2000, 100
 

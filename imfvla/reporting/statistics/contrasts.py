@@ -7,14 +7,14 @@ from operator import itemgetter
 import numpy as np
 import scipy
 
-from imfvla.reporting.bootstrap import Bootstrapped, bootstrap
-from imfvla.reporting.estimates import log_pooled_mean, share_difference
-from imfvla.reporting.measured import Measured
-from imfvla.reporting.pairs import Pairs
-from imfvla.reporting.power import detectable_difference, detectable_share_difference
-from imfvla.reporting.resampling import OfMeans
 from imfvla.reporting.rows import TIMING
-from imfvla.reporting.significance import mcnemar, sign_flip, signed_rank
+from imfvla.reporting.statistics.bootstrap import Bootstrapped, bootstrap
+from imfvla.reporting.statistics.estimates import log_pooled_mean, share_difference
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.pairs import Pairs
+from imfvla.reporting.statistics.power import detectable_difference, detectable_share_difference
+from imfvla.reporting.statistics.resampling import OfMeans
+from imfvla.reporting.statistics.significance import mcnemar, sign_flip, signed_rank
 
 # experiments/protocol.md says which of them is used where
 MCNEMAR, SIGN_FLIP, SEEDS = "exact McNemar", "sign flip", "sign flip, and t over training seeds"
