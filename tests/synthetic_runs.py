@@ -7,7 +7,7 @@ import numpy as np
 import yaml
 
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.metrics import summarise
 
 MACHINE = {"cpu": "a fast CPU", "cpu_flags": ["avx2"], "physical_cores": 2}

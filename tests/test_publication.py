@@ -20,21 +20,8 @@ from imfvla.reporting.mapping import PATH, read_mapping
 from imfvla.storage.files import write_together
 
 MAPPING = read_mapping()
+STEMS = (*(table.name for table in MAPPING.tables), "others")
 ROWS = {row.name: row for row in MAPPING.rows}
-STEMS = (
-    "table1",
-    "table2",
-    "table3",
-    "dwell",
-    "dwell_compared",
-    "table4",
-    "table5",
-    "aloha",
-    "aloha_insertion",
-    "transfer_compared",
-    "needs",
-    "others",
-)
 EXPECTED = Path(__file__).resolve().parent / "expected_tables"
 ANSWERED = ("socket_infer1", "socket_infer2", "socket_ddpm_ph32", "transfer_infer1", "transfer_native_dp")
 

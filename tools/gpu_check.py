@@ -40,8 +40,8 @@ from imfvla.data.statistics import Statistics
 from imfvla.policy import Policy, build_policy
 from imfvla.process.progress import Progress
 from imfvla.process.stopwatch import times_ms
-from imfvla.reporting.bootstrap import bootstrap
 from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.statistics.bootstrap import bootstrap
 from imfvla.reporting.table import Table, number
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.threads import threads

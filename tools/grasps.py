@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imfvla.config.protocol import REPORTING_FIRST_SEED, SELECTION_FIRST_SEED
+from imfvla.config.protocol import FRESH, NOISES, REPORTING_FIRST_SEED, SELECTION_FIRST_SEED
 from imfvla.environments.rollout import run_episode
 from imfvla.episode import Decision, EpisodeInfo, EpisodeResult, Step
 from imfvla.errors import UserError
@@ -152,6 +152,7 @@ def main() -> int:
         "run", type=Path, help="directory of a trained run of one of this package's own tasks"
     )
     parser.add_argument("--nfe", type=int, default=1, help="network steps per chunk")
+    parser.add_argument("--noise", choices=NOISES, default=FRESH, help="that a chunk starts from")
     parser.add_argument("--first-seed", type=int, default=SELECTION_FIRST_SEED, help="of the start states")
     parser.add_argument("--episodes", type=int, default=14, help="of the expert")
     parser.add_argument("--play", type=int, help="episodes of the policy to play instead")
@@ -171,7 +172,7 @@ def main() -> int:
         raise UserError(
             f"The policy must see one step and predict more than {max(LEADS)}, found {policy.horizon}."
         )
-    actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0)
+    actor = ChunkActor(policy, policy.horizon, arguments.nfe, noise_seed=0, noise=arguments.noise)
     seeds, found, early = range(arguments.first_seed, arguments.first_seed + episodes), [], []
     with Progress("episodes", episodes) as progress:
         for seed in seeds:

@@ -9,8 +9,8 @@ from imfvla.benchmarks.sizes import core_inputs
 from imfvla.environment import Environment
 from imfvla.policy import Policy
 from imfvla.process.stopwatch import times_ms
-from imfvla.reporting.bootstrap import bootstrap
-from imfvla.reporting.resampling import OfOrdered, middle
+from imfvla.reporting.statistics.bootstrap import bootstrap
+from imfvla.reporting.statistics.resampling import OfOrdered, middle
 from imfvla.rollouts.actor import ChunkActor
 from imfvla.rollouts.inference import observation_of
 from imfvla.rollouts.threads import threads

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from imfvla.reporting.mapping_comparisons import Comparison
+from imfvla.reporting.mapping.comparisons import Comparison
 from imfvla.reporting.table import Table, number
 
 SAME_STEP = {"generator=imf_plain"}  # overrides that leave the network and its steps as they are

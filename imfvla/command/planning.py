@@ -23,7 +23,7 @@ from imfvla.command import composition
 from imfvla.errors import UserError
 from imfvla.options import build, is_whole, require
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.row import TableRow
 from imfvla.storage.run_directory import EXECUTION_KEYS, LAST, differences
 from imfvla.storage.run_names import key_of
 

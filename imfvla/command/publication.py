@@ -21,7 +21,7 @@ from imfvla.process.progress import Progress
 from imfvla.reporting.answers import Sources, check_equal_protocols
 from imfvla.reporting.comparisons import compare
 from imfvla.reporting.mapping import Mapping as RowMapping
-from imfvla.reporting.mapping_tables import COMPARISONS, METHODS, SETTINGS, TableTitle
+from imfvla.reporting.mapping.tables import COMPARISONS, METHODS, SETTINGS, TableTitle
 from imfvla.reporting.media import Media
 from imfvla.reporting.methods_table import methods_table
 from imfvla.reporting.offline import read_offline

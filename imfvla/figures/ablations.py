@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import BLUE, GREY, INK, WIDTH, new_figure, style
-from imfvla.reporting.measured import Measured
 from imfvla.reporting.results import Result
+from imfvla.reporting.statistics.measured import Measured
 
 BAR = 0.38  # share of the distance between two groups
 

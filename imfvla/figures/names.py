@@ -4,7 +4,7 @@ import re
 from functools import cache
 
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import Evaluation
 

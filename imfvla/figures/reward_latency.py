@@ -11,9 +11,9 @@ from matplotlib.transforms import Affine2D, Bbox
 
 from imfvla.figures.panels import plain_log_ticks
 from imfvla.figures.style import BLACK, CYCLE, GREY, MARKERS, WIDTH, new_figure, style
-from imfvla.reporting.measured import Measured
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.results import Result
+from imfvla.reporting.statistics.measured import Measured
 
 LABEL_HEIGHTS = (-2, 7, -11, 15, -19, 23, -27)  # points above the middle of a marker
 

@@ -10,8 +10,8 @@ from imfvla.config.protocol import CONTINUE, HOLD, MEASURED, NO_PREFIX, PREFIXES
 from imfvla.figures.panels import LINES, numbers, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import CYCLE, MARKERS, WIDTH, new_figure, style
+from imfvla.reporting.mapping.settings import short_labels
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import short_labels
 
 Point = tuple[float, Result]
 Line = tuple[str, str]  # label of the row, and how its chunks begin

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from imfvla.figures.panels import say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import BLUE, GREY, INK, ORANGE, PALE, SKY, WIDTH, new_figure, style
-from imfvla.reporting.power import ALPHA
+from imfvla.reporting.statistics.power import ALPHA
 from imfvla.reporting.two_runs import ComparedMeasure, Duel
 
 OUTCOMES = (("both", BLUE), ("A alone", SKY), ("B alone", ORANGE), ("neither", PALE))

@@ -9,7 +9,7 @@ from typing import Any
 
 from imfvla.errors import UserError
 from imfvla.reporting.mapping import Mapping
-from imfvla.reporting.mapping_row import TableRow, Wanted
+from imfvla.reporting.mapping.row import TableRow, Wanted
 from imfvla.reporting.records import Row
 from imfvla.reporting.runs import Evaluation, evaluations, find_runs, key_of
 from imfvla.storage.run_directory import EXECUTION_KEYS, LAST, RunDirectory, differences, training_steps

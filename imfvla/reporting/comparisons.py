@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from imfvla.reporting.contrasts import (
+from imfvla.reporting.mapping.comparisons import Comparison
+from imfvla.reporting.results import Result
+from imfvla.reporting.statistics.contrasts import (
     return_difference,
     return_ranks,
     return_ratio,
@@ -11,11 +13,9 @@ from imfvla.reporting.contrasts import (
     success_difference,
     success_ratio,
 )
-from imfvla.reporting.mapping_comparisons import Comparison
-from imfvla.reporting.measured import Measured
-from imfvla.reporting.pairs import Pairs, refusal
-from imfvla.reporting.results import Result
-from imfvla.reporting.significance import holm
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.pairs import Pairs, refusal
+from imfvla.reporting.statistics.significance import holm
 
 TIMES = ("inference_ms_mean", "inference_fps")
 CONTRASTS = {  # metric and operation -> function, and whether it takes row and baseline the other way round

@@ -5,8 +5,8 @@ from statistics import median
 
 from imfvla.reporting.cells import BY_NAME
 from imfvla.reporting.curves import training_minutes
-from imfvla.reporting.mapping_methods import MethodEntry
-from imfvla.reporting.mapping_tables import TableTitle
+from imfvla.reporting.mapping.methods import MethodEntry
+from imfvla.reporting.mapping.tables import TableTitle
 from imfvla.reporting.results import Result
 from imfvla.reporting.table import MISSING, NOTHING, Table, number, with_interval
 from imfvla.reporting.tables import Document

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.reporting import estimates
-from imfvla.reporting.estimates import wilson_interval
-from imfvla.reporting.measured import Measured
 from imfvla.reporting.records import Row
 from imfvla.reporting.rows import TIMING
+from imfvla.reporting.statistics import estimates
+from imfvla.reporting.statistics.estimates import wilson_interval
+from imfvla.reporting.statistics.measured import Measured
 
 Episodes = Sequence[Row]
 

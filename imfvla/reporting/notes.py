@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 from imfvla.reporting.cells import BY_NAME
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping_comparisons import Comparison
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.power import ALPHA, POWER, detectable_share_difference
+from imfvla.reporting.mapping import settings
+from imfvla.reporting.mapping.comparisons import Comparison
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.statistics.power import ALPHA, POWER, detectable_share_difference
 
 
 def detectable_success(pairs: int) -> str:
@@ -39,7 +40,7 @@ def names(comparison: Comparison) -> tuple[str, str]:
     if comparison.paper:
         return comparison.paper.comparison, comparison.paper.metric
     row, baseline = comparison.row, comparison.baseline
-    common = set(row.setting.split(", ")) & set(baseline.setting.split(", "))
+    common = set(_parts(row)) & set(_parts(baseline))
     # what both rows have is not said, but how often they call the network is
     common = {part for part in common if not part.startswith("infer")}
     return f"{_short(row, common)} vs {_short(baseline, common)}", BY_NAME[comparison.of].title
@@ -51,8 +52,13 @@ def label(comparison: Comparison) -> str:
 
 
 def _short(row: TableRow, common: set[str]) -> str:
-    own = [part for part in row.setting.split(", ") if part not in common]
+    own = [part for part in _parts(row) if part not in common]
     return f"{row.method} ({', '.join(own)})" if own else row.method
+
+
+def _parts(row: TableRow) -> list[str]:
+    """What the row says of its setting, and how its world differs."""
+    return [*row.setting.split(", "), *([settings.label(row.changes)] if row.changes else [])]
 
 
 def _detectable(found: Compared) -> str:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.escaping import html_text
+from imfvla.reporting.mapping.settings import label
 from imfvla.reporting.media import Media
 from imfvla.reporting.page_rows import anchor, differences_of, rollouts_of
 from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label
 from imfvla.reporting.table import FILL, Table
 from imfvla.reporting.table_row import machine
 

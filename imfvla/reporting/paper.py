@@ -1,4 +1,4 @@
-"""The paper's printed tables, from `experiments/paper`. `mapping.py` says which run fills a row."""
+"""The paper's printed tables, from `experiments/paper`. `mapping` says which run fills a row."""
 
 import csv
 import re

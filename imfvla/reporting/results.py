@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from imfvla.reporting.answers import Answer, Evaluated
-from imfvla.reporting.estimates import wilson_interval
-from imfvla.reporting.mapping_row import TableRow
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.records import Row
 from imfvla.reporting.runs import Evaluation
+from imfvla.reporting.statistics.estimates import wilson_interval
+from imfvla.reporting.statistics.measured import Measured
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 

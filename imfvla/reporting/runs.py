@@ -11,7 +11,7 @@ from imfvla.config.protocol import MAX_EPISODES, REPORTING_SEEDS, USUAL, as_reco
 from imfvla.errors import UserError
 from imfvla.options import require
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.mapping_row import TableRow
+from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.recomputed import DESCRIPTION, description_digest, recomputed
 from imfvla.reporting.records import Row, Summary
 from imfvla.storage.documents import read_json

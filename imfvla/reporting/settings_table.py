@@ -1,16 +1,16 @@
-"""A table of settings: success in each, and what it loses against the unchanged world, start by start."""
+"""A table of settings: success in each, and what it loses against the unchanged row, start by start."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from imfvla.reporting.contrasts import Contrast, return_difference, success_difference
-from imfvla.reporting.mapping_tables import TableTitle
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.mapping.settings import label, name_of, short_labels, world
+from imfvla.reporting.mapping.tables import TableTitle
 from imfvla.reporting.metrics import condition_happened
-from imfvla.reporting.pairs import Pairs, refusal
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, name_of, short_labels, world
-from imfvla.reporting.significance import holm
+from imfvla.reporting.statistics.contrasts import Contrast, return_difference, success_difference
+from imfvla.reporting.statistics.measured import Measured
+from imfvla.reporting.statistics.pairs import Pairs, refusal
+from imfvla.reporting.statistics.significance import holm
 from imfvla.reporting.table import MISSING, REFUSED, Table, interval
 from imfvla.reporting.tables import Document
 
@@ -28,7 +28,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """A row in a setting against the same row in the unchanged world."""
+    """A row in a setting against the same row unchanged."""
 
     result: Result
     usual: Result
@@ -64,9 +64,10 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     rows += [(text, *map(_cell, line)) for text, line in zip(settings, lines, strict=True)]
     keys = [tuple(usual), *(tuple(one.result.name if one else "" for one in line) for line in lines)]
     measured = [one for one in found if one.success]
+    tests = ", ".join(dict.fromkeys(one.success.test for one in measured)) or "none yet"
     notes = [
-        "Successes of so many episodes; in parentheses the difference from the unchanged world in percentage points, "
-        f"from the same starts; last the average return. A star: p below {ALPHA} (exact McNemar, Holm over "
+        "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from "
+        f"the same starts; last the average return. A star: p below {ALPHA} ({tests}; Holm over "
         f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
         *(
@@ -79,7 +80,7 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     ]
     is_missing = any(one.result.is_missing or one.usual.is_missing for one in found)
     commands = ((table.name, f"python -m imfvla.train -m +sweep={table.sweep}"),) if is_missing else ()
-    columns = ("World", *(names[result.row.label] for result in usual.values()))
+    columns = ("Setting", *(names[result.row.label] for result in usual.values()))
     notes = tuple(note for note in notes if note)
     shown = Table(table.title, columns, tuple(rows), notes, commands=commands, cell_keys=tuple(keys))
     data = [_data(Changed(result, result)) for result in usual.values()] + [_data(one) for one in found]
@@ -139,7 +140,7 @@ def _sentence(method: str, measured: Sequence[Changed]) -> str:
         if one.p_holm is not None and one.p_holm < ALPHA and one.success.result.value < 0
     ]
     told = (
-        f"fewer successes than in the unchanged world in {len(lost)} of {len(measured)} settings"
+        f"fewer successes than in the first line in {len(lost)} of {len(measured)} settings"
         if lost
         else f"no setting of {len(measured)} in which fewer successes are told from chance"
     )

@@ -21,7 +21,7 @@ from imfvla.reporting.escaping import (
     markdown_code,
     markdown_text,
 )
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.statistics.measured import Measured
 from imfvla.reporting.terminal import fit
 
 WIDE = 160  # characters a line where no terminal says how many it has

@@ -7,10 +7,10 @@ from typing import Any
 from rich.console import Console
 
 from imfvla.reporting.cells import SHOWN, TITLES, alone, printed
-from imfvla.reporting.estimates import wilson_interval
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.runs import Evaluation, evaluations, rows
+from imfvla.reporting.statistics.estimates import wilson_interval
 from imfvla.reporting.table import Table
 from imfvla.storage.files import write_json, write_text
 from imfvla.storage.run_directory import LAST, RunDirectory

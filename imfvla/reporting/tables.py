@@ -5,13 +5,13 @@ from dataclasses import dataclass, fields
 
 from imfvla.reporting.cells import BY_NAME, SHOWN, TITLES, printed, with_its_interval
 from imfvla.reporting.comparisons import Compared
-from imfvla.reporting.mapping_comparisons import Comparison
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.mapping.comparisons import Comparison
 from imfvla.reporting.metrics import METRICS
 from imfvla.reporting.notes import detectable_success, label, names, pairing
 from imfvla.reporting.paper import PaperRow
 from imfvla.reporting.published import PublishedRow
 from imfvla.reporting.results import Result
+from imfvla.reporting.statistics.measured import Measured
 from imfvla.reporting.table import MISSING, NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.storage.run_directory import LAST

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 from imfvla.errors import UserError
 from imfvla.reporting.answers import Evaluated, read_evaluated
-from imfvla.reporting.contrasts import Contrast, return_difference, speedup, success_difference
-from imfvla.reporting.pairs import Pairs, refusal
-from imfvla.reporting.power import ALPHA, POWER
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import rows
-from imfvla.reporting.significance import holm
+from imfvla.reporting.statistics.contrasts import Contrast, return_difference, speedup, success_difference
+from imfvla.reporting.statistics.pairs import Pairs, refusal
+from imfvla.reporting.statistics.power import ALPHA, POWER
+from imfvla.reporting.statistics.significance import holm
 from imfvla.reporting.table import NOTHING, REFUSED, TOO_FEW, Table, with_interval
 from imfvla.reporting.table_row import machine
 from imfvla.reporting.tables import COLUMNS, ours, p_value

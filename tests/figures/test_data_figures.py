@@ -19,9 +19,9 @@ from imfvla.figures.reward_latency import errors, pareto_frontier, reward_latenc
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.mapping import read_mapping
-from imfvla.reporting.measured import Measured
 from imfvla.reporting.results import Result
 from imfvla.reporting.rows import first_failed_stage
+from imfvla.reporting.statistics.measured import Measured
 
 MAPPING = read_mapping()
 MISSING = ("socket_smolvla", "transfer_dit_ph08_exec08", "socket_l1")

@@ -11,7 +11,7 @@ from synthetic_runs import answer_row
 from imfvla.errors import UserError
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import PATH, read_mapping
-from imfvla.reporting.mapping_methods import MethodEntry
+from imfvla.reporting.mapping.methods import MethodEntry
 from imfvla.reporting.methods_table import methods_table
 from imfvla.reporting.results import Result
 
@@ -61,16 +61,20 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
     ("old", "new", "message"),
     [
         (
-            "rows: [transfer_l1, dwell_l1]",
-            "rows: [transfer_l1, dwell_l3]",
+            "rows: [socket800_l1, transfer_l1, dwell_l1]",
+            "rows: [socket800_l1, transfer_l1, dwell_l3]",
             r"needs, row 10: unknown row 'dwell_l3'",
         ),
         (
-            "rows: [transfer_l1, dwell_l1]",
+            "rows: [socket800_l1, transfer_l1, dwell_l1]",
             "rows: [transfer_l1, transfer_l2]",
             r"rows must be one row of each table",
         ),
-        ("rows: [transfer_l1, dwell_l1]", "rows: []", r"row 10: rows must be one row of each table at most"),
+        (
+            "rows: [socket800_l1, transfer_l1, dwell_l1]",
+            "rows: []",
+            "row 10: rows must be one row of each table",
+        ),
         ('method: "L1 regression", rows', "rows", r"needs, row 10\.method: give it a value"),
     ],
 )

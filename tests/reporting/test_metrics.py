@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imfvla.episode import EpisodeResult
-from imfvla.reporting.estimates import wilson_interval
 from imfvla.reporting.metrics import summarise
 from imfvla.reporting.rows import row_of, untimed
+from imfvla.reporting.statistics.estimates import wilson_interval
 
 
 def result(seed: int, total: float, highest: float, **changes) -> EpisodeResult:

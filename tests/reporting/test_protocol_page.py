@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from synthetic_runs import make_run, write_evaluation
 
-from imfvla.reporting import contrasts, significance
 from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.comparisons import CONTRASTS
 from imfvla.reporting.episodes import read_episodes
-from imfvla.reporting.pairs import Pairs
-from imfvla.reporting.power import ALPHA
 from imfvla.reporting.runs import evaluations
+from imfvla.reporting.statistics import contrasts, significance
+from imfvla.reporting.statistics.pairs import Pairs
+from imfvla.reporting.statistics.power import ALPHA
 from imfvla.storage.run_directory import RunDirectory
 
 PAGE = (Path(__file__).resolve().parents[2] / "experiments" / "protocol.md").read_text(encoding="utf-8")

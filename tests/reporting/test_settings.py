@@ -18,10 +18,12 @@ from imfvla.errors import UserError
 from imfvla.figures.settings import success_by_delay, success_by_severity
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.mapping import read_mapping
+from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.settings import label, rows_of_settings, short_labels
 from imfvla.reporting.media import Media
+from imfvla.reporting.notes import label as comparison_label
 from imfvla.reporting.page import page
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import label, rows_of_settings, short_labels
 from imfvla.reporting.settings_table import settings_table
 
 MAPPING = read_mapping()
@@ -67,13 +69,35 @@ def test_wrong_settings_are_named(entry, message):
         rows(entry)
 
 
+def fills(job: list[str], row: TableRow) -> bool:
+    """Whether a job of a sweep makes the row's evaluation, whatever its training seeds."""
+    given = dict(override.split("=", 1) for override in job)
+    asked = [
+        f"+exp={row.experiment}",
+        *row.overrides,
+        *(f"evaluation.{key}={value}" for key, value in row.changes),
+    ]
+    return set(asked) <= set(job) and row.nfe in yaml.safe_load(given["evaluation.nfe"])
+
+
 def test_every_table_of_settings_is_filled_by_its_sweep():
     for table in MAPPING.of_settings:
         content = yaml.safe_load((folder("conf") / "sweep" / f"{table.sweep}.yaml").read_text())
-        assert content["tables"] == [table.name]
+        assert content["tables"] == [table.name] or all(
+            any(fills(job, row) for job in content["jobs"]) for row in MAPPING.of_table(table.name)
+        )
     jobs = jobs_of_rows(MAPPING.of_table("table4"))
     assert all("evaluation.clock=running" in job or "condition=bump" in job for job in jobs)
     assert len(jobs) == len(set(jobs))
+
+
+def test_a_row_in_a_setting_is_compared_under_the_setting_s_name():
+    same, *_, with_l1 = MAPPING.of_comparisons("transfer_zero_compared")
+    assert with_l1.row.changes == (("noise", "zero"),)
+    assert comparison_label(with_l1).startswith(
+        "iMF-AttnRes, two stages (infer1, zero noise) vs L1 regression"
+    )
+    assert "zero noise" not in comparison_label(same)
 
 
 @pytest.fixture
@@ -112,7 +136,7 @@ def test_lines_are_settings_and_differences_are_from_the_same_starts(results):
     late = f"{counts[2]}/100 ({counts[2] - counts[0]:+d}*), {returns[2]}"
     assert delayed == ("delay 120 ms, continue", late, "missing")
     assert bumped == ("bump 2", f"{counts[4]}/100 (+0), {returns[4]}", "missing")
-    assert "fewer successes than in the unchanged world in 1 of 2 settings" in " ".join(document.shown.notes)
+    assert "fewer successes than in the first line in 1 of 2 settings" in " ".join(document.shown.notes)
     assert document.shown.commands == (("table4", "python -m imfvla.train -m +sweep=clock"),)
     lines = list(csv.DictReader(io.StringIO(document.data.csv())))
     assert [(line["setting"], line["status"]) for line in lines] == [

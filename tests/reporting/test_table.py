@@ -6,7 +6,7 @@ import io
 import pytest
 from rich.console import Console
 
-from imfvla.reporting.measured import Measured
+from imfvla.reporting.statistics.measured import Measured
 from imfvla.reporting.table import FILL, Table, interval, number, with_interval
 
 TABLE = Table(
@@ -42,8 +42,8 @@ def test_latex_has_as_many_cells_in_every_line_and_no_special_character_left():
 
 
 def test_a_long_name_of_a_column_is_broken_in_latex():
-    text = Table("Title", ("World", "Flow, high-noise times (infer2)"), (("unchanged", "90/100"),)).latex()
-    assert "World & \\shortstack[l]{Flow, high-noise \\\\ times (infer2)} \\\\\n" in text
+    text = Table("Title", ("Setting", "Flow, high-noise times (infer2)"), (("unchanged", "90/100"),)).latex()
+    assert "Setting & \\shortstack[l]{Flow, high-noise \\\\ times (infer2)} \\\\\n" in text
 
 
 def test_text_has_the_commands_once():

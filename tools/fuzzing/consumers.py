@@ -35,13 +35,13 @@ from imfvla.figures.two_runs import two_runs
 from imfvla.reporting.answers import Sources
 from imfvla.reporting.curves import learning_curve
 from imfvla.reporting.mapping import TableRow, read_mapping
+from imfvla.reporting.mapping.settings import rows_of_settings
 from imfvla.reporting.media import Media
 from imfvla.reporting.offline import read_offline
 from imfvla.reporting.offline_tables import by_channel, by_step, offline_table
 from imfvla.reporting.page import page
 from imfvla.reporting.recomputed import DESCRIPTION, description_digest
 from imfvla.reporting.results import Result
-from imfvla.reporting.settings import rows_of_settings
 from imfvla.reporting.settings_table import settings_table
 from imfvla.reporting.table_row import print_row
 from imfvla.reporting.tables import other_table

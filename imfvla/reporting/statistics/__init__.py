@@ -1,0 +1,1 @@
+"""Intervals and tests: of one policy, and of two whose episodes are pairs."""
