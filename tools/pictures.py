@@ -43,6 +43,7 @@ FIGURES = {  # picture -> figure of imfvla.report
 } | {
     "reward_latency": "figure3_reward_latency",
     "success_by_cost": "success_by_cost_dwell",
+    "success_by_cost_socket": "success_by_cost_socket_equal",
     "success_by_delay": "success_by_delay_table4",
     "success_by_severity": "success_by_severity_table5",
 }

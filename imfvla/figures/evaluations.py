@@ -7,10 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imfvla.figures.names import policy_of
-from imfvla.figures.panels import look, nfe_ticks, own_tables, panels_of, say_nothing_yet
+from imfvla.figures.panels import look, nfe_ticks, own_table, panels_of, say_nothing_yet
 from imfvla.figures.reward_latency import errors
 from imfvla.figures.style import WIDTH, new_figure, style
-from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.results import Result
 
 COLUMNS = 3
@@ -22,8 +21,7 @@ def success_by_evaluations(results: Sequence[Result]) -> Figure:
 
     Tables that are not the paper's are left out.
     """
-    elsewhere = own_tables(read_mapping())
-    shown = [result for result in results if result.is_last and result.first.experiment not in elsewhere]
+    shown = [result for result in results if result.is_last and own_table(result) is None]
     last = sorted(shown, key=lambda result: result.policy)
     lines = [sorted(line, key=lambda result: result.nfe) for _, line in groupby(last, lambda r: r.policy)]
     lines = [line for line in lines if len(line) > 1]

@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from imfvla.figures.description import class_of
 from imfvla.figures.style import CYCLE, GREY, MARKERS
-from imfvla.reporting.mapping import Mapping, read_mapping
+from imfvla.reporting.mapping import read_mapping
 from imfvla.reporting.results import Result
 
 LINES = ("-", "--", ":", "-.")
@@ -18,30 +18,36 @@ LINES = ("-", "--", ":", "-.")
 def panels_of(results: Sequence[Result]) -> dict[str, list[Result]]:
     """Results by the title of their panel: the printed tables' tasks first, then the others, by title.
 
-    The experiments of a table that is not the paper's have a panel of their own, with its title: they may play a task
-    of the paper with other demonstrations.
+    A table that is not the paper's has a panel of its own, with its title: it may play a task of the paper with other
+    demonstrations.
     """
     mapping = read_mapping()
-    own = own_tables(mapping)
     drawn = {table.task for table in mapping.of_rows if table.printed is not None}
     found: dict[str, list[Result]] = {task.title: [] for task in mapping.tasks if task.name in drawn}
     first = list(found)
     for result in results:
         if result.is_missing:
             continue
-        title = own.get(result.first.experiment) or mapping.task(result.task or "").title
+        title = own_table(result) or mapping.task(result.task or "").title
         found.setdefault(title, []).append(result)
     return {title: found[title] for title in (*first, *sorted(set(found) - set(first)))}
 
 
-def own_tables(mapping: Mapping) -> dict[str, str]:
-    """The title of its table by the name of each experiment whose table is not the paper's."""
-    return {
-        row.experiment: table.title
-        for table in mapping.of_rows
-        if table.printed is None
-        for row in mapping.of_table(table.name)
-    }
+def own_table(result: Result) -> str | None:
+    """The title of the result's table, None where that is one of the paper's.
+
+    A result that is no row belongs to the table of its experiment's rows, to the paper's if there are several.
+    """
+    mapping = read_mapping()
+    rows = (
+        [result.row]
+        if result.row
+        else [row for row in mapping.rows if row.experiment == result.first.experiment]
+    )
+    of_rows = {table.name: table for table in mapping.of_rows}
+    tables = [of_rows[row.table] for row in rows if row.table in of_rows]
+    printed = any(table.printed is not None for table in tables)
+    return None if printed or not tables else tables[0].title
 
 
 def stages_of(results: Sequence[Result]) -> tuple[str, ...]:

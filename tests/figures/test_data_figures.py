@@ -118,6 +118,16 @@ def test_a_bar_of_failures_ends_at_their_share(results):
         np.testing.assert_allclose(sorted(ends), sorted(shares), atol=1e-9)
 
 
+def test_rows_of_one_experiment_are_in_the_panels_of_their_tables(results, tmp_path):
+    names = {title: {result.row.name for result in found} for title, found in panels_of(results).items()}
+    assert "socket800_imf_infer1" in names["Socket peg insertion, 800 demonstrations"]
+    assert {"socket_infer2", "socket_ddpm_ph16", "socket_act"} <= names["socket peg insertion"]
+    outside = make_run(tmp_path / "socket_ph32_exec16" / "x", "socket_ph32_exec16")
+    write_evaluation(outside, 1, number=100)
+    (other,) = [Result(evaluated) for evaluated in Sources([tmp_path]).others([])]
+    assert other in panels_of([other])["socket peg insertion"]
+
+
 def test_results_of_a_method_are_grouped_under_its_name(results):
     socket = failed_stages(of_table(results, "table1")).axes[0]
     names = [label.get_text().replace("\N{FIGURE SPACE}", "") for label in socket.get_yticklabels()]
