@@ -175,6 +175,11 @@ def masked_error(error: Tensor, valid: Tensor) -> Tensor:
     return masked_mean(error.square(), valid)
 
 
+def adapted(error: Tensor, power: float, offset: float) -> Tensor:
+    """error / sg(error + offset) ** power: large errors count for less (arXiv 2505.13447)."""
+    return error if power == 0 else error / (error.detach() + offset) ** power
+
+
 def refuse_nfe(wanted: str, nfe: int) -> UserError:
     """The error of a generator that needs `wanted` calls of the core and was asked for `nfe`."""
     return UserError(f"nfe, the number of network steps, must be {wanted}, found {nfe}.")

@@ -19,9 +19,16 @@ from torch import Tensor, nn
 
 from imfvla.draws import Stream, draw
 from imfvla.errors import UserError
-from imfvla.generators.base import LAST_STEP, ancestral_noise, masked_error, refuse_nfe, step_times
+from imfvla.generators.base import (
+    LAST_STEP,
+    adapted,
+    ancestral_noise,
+    masked_error,
+    refuse_nfe,
+    step_times,
+)
 from imfvla.generators.inpainting import Target, pull, strength
-from imfvla.options import above
+from imfvla.options import above, at_least
 
 MAX_BETA = 0.999
 
@@ -52,6 +59,7 @@ class DenoisingDiffusion:
     draws: noise draws per observation; the observation is encoded once for all of them.
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
     last_step: of DDIM, the share of the levels below which the last of several steps is taken, see `step_times`.
+    adaptive_power, adaptive_offset: see `adapted`; the source's loss has power 0.
     """
 
     core_interface = "flow"
@@ -65,6 +73,8 @@ class DenoisingDiffusion:
         draws: int,
         clip: Annotated[float, above(0)],
         last_step: Annotated[float, LAST_STEP] | None = None,
+        adaptive_power: Annotated[float, at_least(0)] = 0.0,
+        adaptive_offset: Annotated[float, above(0)] = 1e-3,
     ) -> None:
         if prediction not in ("epsilon", "sample", "v"):
             raise UserError(f"generator.prediction must be epsilon, sample or v, found {prediction!r}.")
@@ -76,6 +86,7 @@ class DenoisingDiffusion:
         self.clip_sample, self.clip = clip_sample, clip
         self.draws, self.last_step = draws, last_step
         self.num_levels = num_levels
+        self.adaptive_power, self.adaptive_offset = adaptive_power, adaptive_offset
         self.kept = squared_cosine(num_levels).tolist()
 
     def loss(
@@ -92,7 +103,8 @@ class DenoisingDiffusion:
         t = ((k + 1) / self.num_levels).to(x)
         output = core(z, t, t, context.repeat(self.draws))
         error = masked_error(output - target, valid.repeat_interleave(self.draws, dim=0))
-        return error.unflatten(0, (len(actions), -1)).mean(1), {"denoising_error": error.detach().mean()}
+        counted = adapted(error, self.adaptive_power, self.adaptive_offset)
+        return counted.unflatten(0, (len(actions), -1)).mean(1), {"denoising_error": error.detach().mean()}
 
     def estimate(self, core: nn.Module, z: Tensor, k: int, context: Any) -> tuple[Tensor, Tensor]:
         """Clean action and noise (B, H, A) that the core sees in z (B, H, A) at level k."""

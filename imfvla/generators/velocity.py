@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from imfvla.draws import Stream, draw
 from imfvla.errors import UserError
-from imfvla.generators.base import LAST_STEP, TimeSampler, refuse_nfe, step_times
+from imfvla.generators.base import LAST_STEP, TimeSampler, adapted, refuse_nfe, step_times
 from imfvla.generators.inpainting import Target, pull, strength
 from imfvla.nn.dual import Rows, Tape, as_written
 from imfvla.nn.forward_mode import jvp
@@ -33,7 +33,7 @@ class LinearPath:
 
     parametrisation: what the network outputs: the "velocity" u itself, or the clean action D = z - t u ("data").
     time_power: errors of velocities are weighted by t ** time_power; 2 makes them errors of the clean action.
-    adaptive_power, adaptive_offset: see `adapt`.
+    adaptive_power, adaptive_offset: see `adapted`.
     draws: noise draws per observation; the observation is encoded once for all of them.
     clip: normalised actions lie within [-clip, clip]; the final sample is clamped there.
     last_step: the time from which the last of several steps is taken, see `step_times`.
@@ -91,15 +91,10 @@ class LinearPath:
         noise = draw(torch.randn, x.shape, rng=rng).to(x)
         return x, noise, valid.repeat_interleave(self.draws, dim=0)
 
-    def adapt(self, error: Tensor) -> Tensor:
-        """error / sg(error + offset) ** power: large errors count for less (arXiv 2505.13447)."""
-        if self.adaptive_power == 0:
-            return error
-        return error / (error.detach() + self.adaptive_offset) ** self.adaptive_power
-
     def per_chunk(self, error: Tensor, batch: int) -> Tensor:
         """Adapted errors of all draws (B * N,) as the loss of each chunk, a mean over its draws (B,)."""
-        return self.adapt(error).unflatten(0, (batch, -1)).mean(1)
+        counted = adapted(error, self.adaptive_power, self.adaptive_offset)
+        return counted.unflatten(0, (batch, -1)).mean(1)
 
     def check_nfe(self, nfe: int) -> None:
         """Any number of steps is possible but none."""

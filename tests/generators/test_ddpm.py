@@ -10,7 +10,7 @@ from torch import nn
 
 from imfvla.errors import UserError
 from imfvla.generators import ddpm
-from imfvla.generators.base import ancestral_noise
+from imfvla.generators.base import adapted, ancestral_noise
 from imfvla.generators.ddpm import DenoisingDiffusion, squared_cosine, trailing_levels
 
 LEVELS = 100
@@ -251,3 +251,36 @@ if importlib.util.find_spec("diffusers"):
         torch.testing.assert_close(
             squared_cosine(LEVELS).float(), reference.alphas_cumprod, rtol=1e-4, atol=1e-9
         )
+
+
+def test_half_the_adaptive_power_is_the_pseudo_huber_loss():
+    """error / sg(error + c)^(1/2) has the gradient of 2 sqrt(error + c)."""
+    error = torch.tensor([0.0, 1e-4, 0.1, 30.0], dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(adapted(error, 0.5, 1e-3).sum(), error)
+    (expected,) = torch.autograd.grad(2 * (error + 1e-3).sqrt().sum(), error)
+    torch.testing.assert_close(found, expected)
+
+
+def test_an_adaptive_power_makes_one_far_chunk_count_for_less():
+    """Of two chunks, one of which is far from what is predicted."""
+    actions, valid = torch.zeros(2, *MEAN.shape, dtype=torch.float64), torch.ones(2, STEPS, dtype=torch.bool)
+    actions[1] += 100
+    plain, counted = (
+        generator(prediction="sample", adaptive_power=power).loss(
+            Nothing(), Context(), actions, valid, stream()
+        )[0]
+        for power in (0.0, 0.5)
+    )
+    torch.testing.assert_close(plain, torch.tensor([0.0, 1e4], dtype=torch.float64))
+    torch.testing.assert_close(counted, plain / (plain + 1e-3).sqrt())
+
+
+class Nothing(nn.Module):
+    """Predicts 0."""
+
+    def forward(self, z, t, r, context):
+        return torch.zeros_like(z)
+
+
+def stream():
+    return torch.Generator().manual_seed(0)
