@@ -13,6 +13,7 @@ EPISODES ?= 4
 ARGS ?=
 HASHES ?=
 
+SHIPPED_socket := socket_ph32_exec16/demos.episodes=800,seed=0
 SHIPPED_dwell := transfer_dwell/seed=0
 SHIPPED := experiments/pretrained/$(or $(SHIPPED_$(TASK)),$(TASK)_ph32_exec16/default)
 VENV := .venv

@@ -2,7 +2,7 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from imfvla.storage.records import WeightsDescription, read_record
 from imfvla.storage.run_directory import LAST, RunDirectory
 
 NAME = "README.md"
+OF_NOISE = {"noise", "noise_scale", "candidates"}  # keys of a protocol
 LIMITS = (
     "It was trained and measured in simulation alone, with one robot, these cameras where they are, and scripted "
     "demonstrations. It knows no other scene, robot or sentence, and has no part that keeps a real robot safe."
@@ -34,21 +35,27 @@ def model_card(run: RunDirectory, place: Path, command: str) -> str:
         run.policy_weights(LAST).with_suffix(".json"), WeightsDescription, "restore it or train again"
     )
     found = [evaluation for evaluation in evaluations(run, config) if evaluation.is_reporting]
-    usual = sorted((e for e in found if e.is_usual), key=lambda e: (e.summary["checkpoint_step"], e.nfe))
+    usual = _sorted(e for e in found if e.is_usual)
+    other_noise = _sorted(e for e in found if e.changes and set(e.changes) <= OF_NOISE)
+    left = len(found) - len(usual) - len(other_noise)
     sections = [
         f"# {markdown_text('/'.join(place.parts[-2:]))}",
         _facts(config, weights),
         "## Results",
-        _results(usual),
+        _results([*usual, *other_noise]),
         _failures(usual),
     ]
-    if len(found) > len(usual):
+    if left:
         sections.append(
-            f"Its {len(found) - len(usual)} evaluations with a running clock, other noise or a changed world are in "
-            "`rollouts/`; `make tables` shows them."
+            f"Its {left} evaluations with a running clock or in a changed world are in `rollouts/`; `make tables` "
+            "shows them."
         )
     sections += ["## Use", _use(place, command, usual), "## Limits", LIMITS]
     return "\n\n".join(section for section in sections if section) + "\n"
+
+
+def _sorted(found: Iterable[Evaluation]) -> list[Evaluation]:
+    return sorted(found, key=lambda e: (e.summary["checkpoint_step"], e.nfe))
 
 
 def _facts(config: Mapping[str, Any], weights: WeightsDescription) -> str:
@@ -98,16 +105,17 @@ def _of_task(task: Mapping[str, Any], demos: Mapping[str, Any]) -> dict[str, str
     return {"task": f"{task['name']}{variant}", "demonstrations": ", ".join((source, *shown))}
 
 
-def _results(usual: Sequence[Evaluation]) -> str:
-    first = usual[0]
+def _results(found: Sequence[Evaluation]) -> str:
+    first = found[0]
     shown = ("success_episodes", "avg_return", "median_return")
     columns = ("Evaluations of the network", "Weights", *(BY_NAME[name].title for name in shown), "Chunk ms")
     rows = []
-    for evaluation in usual:
+    for evaluation in found:
         result = Result([Evaluated(evaluation, evaluation.episodes)])
         cells = [with_its_interval(BY_NAME[name], result) for name in shown]
         ms = number(evaluation.summary["inference_ms_median"], 1)
-        rows.append((str(evaluation.nfe), f"step {evaluation.summary['checkpoint_step']}", *cells, ms))
+        nfe = ", ".join((str(evaluation.nfe), *evaluation.unusual))
+        rows.append((nfe, f"step {evaluation.summary['checkpoint_step']}", *cells, ms))
     table = Table("", columns, tuple(rows)).markdown().partition("\n\n")[2].strip()
     said = (
         f"{len(first.episodes)} episodes from seeds {first.seeds[0]} to {first.seeds[-1]}, never used for a choice. In "
@@ -118,7 +126,7 @@ def _results(usual: Sequence[Evaluation]) -> str:
 
 
 def _failures(usual: Sequence[Evaluation]) -> str:
-    """How often each stage was the first that failed, over all results of the last weights."""
+    """How often each stage was the first that failed, over all `usual` results of the last weights."""
     stages = usual[-1].summary.get("stages") or []
     rows = [row for e in usual if e.summary["checkpoint_step"] == e.training_steps for row in e.episodes]
     failed = [row for row in rows if not row["success"]]
@@ -127,9 +135,8 @@ def _failures(usual: Sequence[Evaluation]) -> str:
     counts = Counter(first_failed_stage(row) for row in failed)
     del counts[None]  # all stages held, but not to the end
     told = ", ".join(f"{stages[stage]} {count}" for stage, count in sorted(counts.items()))
-    return (
-        f"Of {len(rows)} episodes {len(failed)} failed, by the first stage that they did not reach: {told}."
-    )
+    of_all = f"Of the {len(rows)} episodes with full noise {len(failed)} failed"
+    return f"{of_all}, by the first stage that they did not reach: {told}."
 
 
 def _use(place: Path, command: str, usual: Sequence[Evaluation]) -> str:
