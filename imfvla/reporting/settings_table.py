@@ -72,7 +72,7 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
         f"All methods: {shared}." if shared else "",
         *(
             _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
-            for name in usual
+            for name in (usual if len(settings) > 1 else ())  # one setting says itself
         ),
         *_side_by_side(names, found),
         *_events([one.result for one in found]),
