@@ -11,7 +11,7 @@ def printed(command, *arguments, capsys):
 def test_help_says_what_the_command_does_and_lists_groups_and_keys(capsys):
     text = printed(train, capsys=capsys)
     assert text.startswith("python -m imfvla.train +exp=NAME: collects what is missing")
-    assert "\ngenerator: act, ddpm, flow" in text
+    assert "\ngenerator: act, ddpm, ddpm_adaptive, flow" in text
     assert "\n+exp: aloha_insertion_act, " in text
     assert "\nseed: 0\n" in text
     assert "\nhydra" not in text
