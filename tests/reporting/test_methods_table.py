@@ -73,7 +73,7 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
             "rows: []",
-            "row 10: rows must be one row of each table",
+            r"row 10: rows must be one row of each table at most",
         ),
         ('method: "L1 regression", rows', "rows", r"needs, row 10\.method: give it a value"),
     ],

@@ -86,5 +86,7 @@ def _comparison(
 
 
 def _row(name: str, rows: dict[str, TableRow], where: str) -> TableRow:
-    usual = {usual: row for usual, row in rows.items() if not row.changes}  # the message names these alone
-    return rows[name] if name in rows else named(name, usual, f"{where}: unknown row")
+    if name in rows:
+        return rows[name]
+    usual = {other: row for other, row in rows.items() if not row.changes}  # the message names these alone
+    return named(name, usual, f"{where}: unknown row")
