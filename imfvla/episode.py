@@ -73,6 +73,10 @@ class EpisodeResult:
     condition_happened: bool | None = None  # of a condition that is an event, whether it came
 
 
+class ActionError(Exception):
+    """Raised by an actor without a usable action; the episode then ends, failed with this label."""
+
+
 class Actor(Protocol):
     """Chooses actions. A demonstrator may read the simulator behind `env`; a policy only looks through its cameras."""
 

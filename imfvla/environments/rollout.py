@@ -8,16 +8,12 @@ from typing import Any
 import numpy as np
 
 from imfvla.environment import Environment, Outcome
-from imfvla.episode import Actor, EpisodeInfo, EpisodeResult, Sink, Step
+from imfvla.episode import ActionError, Actor, EpisodeInfo, EpisodeResult, Sink, Step
 from imfvla.errors import UserError
 
 NON_FINITE = "non-finite action"
 FAR_OUT_OF_RANGE = "action far out of range"
 SIMULATION_ENDED = "simulation ended early"
-
-
-class ActionError(Exception):
-    """Raised by an actor without a usable action; the episode then ends, failed with this label."""
 
 
 Running = Generator[

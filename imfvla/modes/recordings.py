@@ -26,7 +26,7 @@ from imfvla.storage.records import read_record
 
 MOST_FAILURES = 20  # of the expert, before it is given up
 # What a recording must share with the run. Its noise, and the time held after success, may differ.
-SHARED = ("task", "variant", "modes", "dwell", "recoveries", "image_size")
+SHARED = ("task", "variant", "modes", "dwell", "recoveries", "max_turn", "image_size")
 REMEDY = "leave --demos out to have the expert play"
 
 

@@ -12,8 +12,8 @@ import torch
 from imfvla.config.horizon import Horizon
 from imfvla.config.protocol import CONTINUE, FRESH, GUIDED, NO_PREFIX, USUAL_NOISE
 from imfvla.environment import Environment
-from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE, ActionError
-from imfvla.episode import Decision
+from imfvla.environments.rollout import FAR_OUT_OF_RANGE, NON_FINITE
+from imfvla.episode import ActionError, Decision
 from imfvla.generators.inpainting import soft_weights
 from imfvla.policy import Policy
 from imfvla.policy.prefix import Known

@@ -32,7 +32,7 @@ OF_DEMONSTRATIONS = Limit(
     lambda seed: any(seed in band for band in DEMONSTRATION_SEEDS),
 )
 # What folders were recorded with before a setting had a name.
-LATER_SETTINGS = {"dwell": 0, "recoveries": 0}
+LATER_SETTINGS = {"dwell": 0, "recoveries": 0, "max_turn": None}
 log = logging.getLogger(__name__)
 
 

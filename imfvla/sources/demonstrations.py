@@ -55,6 +55,7 @@ class ExpertOptions:
     hold: int
     dwell: int
     recoveries: float = 0  # older than runs without it
+    max_turn: float | None = None  # the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ class BimanualSettings:
     hold: int
     dwell: int
     recoveries: float
+    max_turn: float | None
     views: tuple[str, ...]
     image_size: tuple[int, int]
     camera_every: int
@@ -77,15 +79,20 @@ class BimanualSettings:
         height, width = self.image_size
         waiting = f"-dwell{self.dwell}" if self.dwell else ""
         missing = f"-recoveries{self.recoveries:g}" if self.recoveries else ""
-        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}-{height}x{width}"
+        smooth = f"-turn{self.max_turn:g}" if self.max_turn is not None else ""
+        return f"{self.task}-{self.variant}-modes{self.modes}{waiting}{missing}{smooth}-{height}x{width}"
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         return (self.image_size,) * len(self.views)
 
     def to_json(self) -> dict[str, Any]:
-        """Without `recoveries` where there are none: such recordings have the bytes that they had before."""
-        return {key: value for key, value in asdict(self).items() if key != "recoveries" or value}
+        """Without what is newer than the first recordings and not asked for: such files have the bytes that they had."""
+        return {
+            key: value
+            for key, value in asdict(self).items()
+            if key not in ("recoveries", "max_turn") or value not in (0, None)
+        }
 
     def build(self) -> tuple[Environment, Actor]:
         from imfvla.tasks.experts import make_expert  # here, since it imports the simulator
@@ -103,6 +110,7 @@ class BimanualSettings:
             hold=self.hold,
             dwell=self.dwell,
             recoveries=self.recoveries,
+            max_turn=self.max_turn,
         )
 
 

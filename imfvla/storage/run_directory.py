@@ -67,7 +67,12 @@ DERIVED_KEYS = (
     "core.state_token",
 )
 # What a key is in a run that is older than the key.
-LATER_KEYS = {"demos.source": "scripted", "horizon.prefix_max": 0, "task.expert.recoveries": 0}
+LATER_KEYS = {
+    "demos.source": "scripted",
+    "horizon.prefix_max": 0,
+    "task.expert.recoveries": 0,
+    "task.expert.max_turn": None,
+}
 
 
 class RunDirectory:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imfvla.episode import Decision
+from imfvla.episode import ActionError, Decision
 from imfvla.errors import UserError
 from imfvla.tasks.bimanual import SIDES, Pose
 from imfvla.tasks.bimanual_environment import BimanualEnvironment
@@ -36,6 +36,8 @@ class Expert:
             waits for nothing. Nothing in the observation shows how long it will wait.
         recoveries: share of the demonstrations in which a first grasp fails and the expert grasps again; which ones is
             drawn from the seed. Until the last hand that missed goes back, steps are marked as nothing to imitate.
+        max_turn: by how much the target of a joint may change from one control step to the next [rad]. A demonstration
+            in which it changes more has failed, as where a wrist passes a singularity; None refuses nothing.
     """
 
     task_name: str
@@ -43,7 +45,16 @@ class Expert:
     # which hands may miss, the one or the other or both together; one is drawn
     misses: tuple[tuple[str, ...], ...] = (("right",),)
 
-    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0) -> None:
+    def __init__(
+        self,
+        *,
+        modes: int,
+        noise: float,
+        hold: int,
+        dwell: int,
+        recoveries: float = 0,
+        max_turn: float | None = None,
+    ) -> None:
         if modes not in (1, 2, 4):
             raise UserError(f"task.expert.modes must be 1, 2 or 4, found {modes!r}.")
         if not 0 <= noise <= 0.05:
@@ -59,8 +70,12 @@ class Expert:
             raise UserError(
                 f"task.expert.recoveries is a share of the demonstrations, 0 to 1, found {recoveries!r}."
             )
+        if max_turn is not None and not max_turn > 0:
+            raise UserError(
+                f"task.expert.max_turn is a joint angle [rad] above 0, or null for any, found {max_turn!r}."
+            )
         self.modes, self.noise, self.hold, self.dwell = modes, noise, hold, dwell
-        self.recoveries = recoveries
+        self.recoveries, self.max_turn = recoveries, max_turn
         self.style: dict[str, Any] = {}
         self.hands: dict[str, Hand] = {}
 
@@ -97,6 +112,7 @@ class Expert:
         self._disturbance = np.zeros(len(env.robot.action))
         self._limits = tuple(np.float32(limits) for limits in (env.robot.action_min, env.robot.action_max))
         self._steps_since_success = -1
+        self._last_joints: np.ndarray | None = None
 
     def draw_style(self, rng: np.random.Generator) -> Mapping[str, float]:
         """Draws what varies besides mode, speed and approach height."""
@@ -107,7 +123,7 @@ class Expert:
         raise NotImplementedError
 
     def act(self, env: BimanualEnvironment, state: np.ndarray, step: int) -> Decision:
-        """The clean action, and the same with smooth joint noise to be executed."""
+        """The clean action, and the same with smooth joint noise to be executed. ActionError beyond `max_turn`."""
         for hand in self.hands.values():
             hand.measure(env, state)
         # Of a demonstration without a miss nothing is said.
@@ -121,7 +137,16 @@ class Expert:
             scale[ARM[side]] = self.noise * self.hands[side].freedom
         disturbed = clean + scale * self._disturbance
         clean, disturbed = (np.clip(a, *self._limits).astype(np.float32) for a in (clean, disturbed))
+        self._refuse_jump(np.concatenate([clean[ARM[side]] for side in SIDES]))
         return Decision(action=clean, executed=disturbed, imitate=imitate)
+
+    def _refuse_jump(self, joints: np.ndarray) -> None:
+        last, self._last_joints = self._last_joints, joints
+        if last is None or self.max_turn is None:
+            return
+        turn = float(np.abs(joints - last).max())
+        if turn > self.max_turn:
+            raise ActionError(f"a joint's target jumps by {turn:.2f} rad")
 
     def done(self, env: BimanualEnvironment) -> bool:
         """Whether success has been held long enough to end the demonstration; to be asked once after each step."""

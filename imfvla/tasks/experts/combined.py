@@ -13,8 +13,7 @@ from imfvla.tasks.experts.transfer import TransferExpert
 class CombinedExpert:
     """An `episode.Actor` with the arguments of `Expert`."""
 
-    def __init__(self, *, modes: int, noise: float, hold: int, dwell: int, recoveries: float = 0) -> None:
-        shared = {"modes": modes, "noise": noise, "hold": hold, "recoveries": recoveries}
+    def __init__(self, *, dwell: int, **shared: Any) -> None:
         self._experts = {
             "socket": SocketExpert(**shared, dwell=0),
             "transfer": TransferExpert(**shared, dwell=dwell),
