@@ -87,7 +87,7 @@ class BimanualSettings:
         return (self.image_size,) * len(self.views)
 
     def to_json(self) -> dict[str, Any]:
-        """Without what is newer than the first recordings and not asked for: such files have the bytes that they had."""
+        """Without what is newer and not asked for: such recordings have the bytes that they had before."""
         return {
             key: value
             for key, value in asdict(self).items()

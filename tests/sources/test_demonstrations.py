@@ -23,13 +23,15 @@ def test_folders_are_named_after_task_and_pictures():
     assert (
         settings("socket", "task.expert.recoveries=0.3").folder == "socket-default-modes2-recoveries0.3-96x96"
     )
+    assert settings("socket", "task.expert.max_turn=0.1").folder == "socket-default-modes2-turn0.1-96x96"
     assert settings("aloha_transfer", *ALOHA).folder == "aloha_transfer-48x64"
 
 
-def test_recordings_without_recoveries_say_what_they_said_before_there_were_any():
-    usual, missing = settings("socket"), settings("socket", "task.expert.recoveries=0.3")
-    assert missing.to_json() == usual.to_json() | {"recoveries": 0.3}
-    assert "recoveries" not in usual.to_json()
+@pytest.mark.parametrize(("key", "value"), [("recoveries", 0.3), ("max_turn", 0.1)])
+def test_recordings_without_a_newer_setting_say_what_they_said_before_there_was_any(key, value):
+    usual, asked = settings("socket"), settings("socket", f"task.expert.{key}={value}")
+    assert asked.to_json() == usual.to_json() | {key: value}
+    assert key not in usual.to_json()
 
 
 def test_whatever_changes_the_recordings_changes_the_settings():

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from imfvla import tasks
+from imfvla.episode import ActionError
 from imfvla.errors import UserError
 from imfvla.tasks.experts import make_expert
 from imfvla.tasks.experts.either_arm import EitherArmExpert
@@ -183,3 +184,30 @@ def test_mistakes_are_named(arguments, message):
 def test_an_expert_refuses_another_task(transfer_env):
     with pytest.raises(UserError, match="expert of 'socket' was given the task 'transfer'"):
         make_expert("socket", modes=1, noise=0.0, hold=18, dwell=0).reset(transfer_env, 0)
+
+
+def test_a_demonstration_fails_where_a_joint_target_jumps(socket_env):
+    """Of the first 700 seeds of the socket task 129 alone passes a singularity of the wrist."""
+    style = {"modes": 2, "noise": 0.004, "hold": 60, "dwell": 0}
+    usual, smooth = make_expert("socket", **style), make_expert("socket", max_turn=0.1, **style)
+    _, _, decisions = play(socket_env, usual, 129)
+    joints = np.array([np.concatenate([d.action[:7], d.action[8:15]]) for d in decisions])
+    turns = np.abs(np.diff(joints, axis=0)).max(axis=1)
+    first = int(np.argmax(turns > 0.1)) + 1
+    assert turns.max() > 0.1
+    socket_env.reset(129)
+    smooth.reset(socket_env, 129)
+    for step in range(first):
+        decision = smooth.act(socket_env, socket_env.state(), step)
+        assert np.array_equal(decision.action, decisions[step].action)
+        socket_env.step(decision.executed)
+    with pytest.raises(ActionError, match=rf"a joint's target jumps by {turns[first - 1]:.2f} rad"):
+        smooth.act(socket_env, socket_env.state(), first)
+
+
+@pytest.mark.parametrize("turn", [0, -0.1])
+def test_a_largest_turn_is_above_0(turn):
+    with pytest.raises(
+        UserError, match=r"task\.expert\.max_turn is a joint angle \[rad\] above 0, or null for any"
+    ):
+        make_expert("socket", modes=2, noise=0.004, hold=60, dwell=0, max_turn=turn)

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from imfvla.options import build, require
+from imfvla.options import DIFFERENT, build, require, within_length
 from imfvla.reporting.mapping.file import entries, named, place_of, plain
 from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.mapping.tables import COMPARISONS, TableTitle, check_each_once
@@ -33,7 +33,7 @@ class Comparison:
 @dataclass(frozen=True, slots=True)
 class _ComparisonEntry:
     row: str
-    baseline: str
+    baseline: Annotated[tuple[str, ...], DIFFERENT, within_length(1, 100)]
     of: str
     operation: str
     paper: str | None = None
@@ -51,8 +51,9 @@ def read_comparisons(
     for table in tables:
         if table.of == COMPARISONS:
             found = [
-                _comparison(entry, table, number, path, by_name)
+                comparison
                 for number, entry in enumerate(entries(content, table.name, path), 1)
+                for comparison in _comparisons(entry, table, number, path, by_name)
             ]
             if table.printed is not None:
                 printed = [comparison.label for comparison in paper_comparisons(table.printed)]
@@ -61,13 +62,16 @@ def read_comparisons(
     return tuple(comparisons)
 
 
-def _comparison(
+def _comparisons(
     entry: dict[str, Any], table: TableTitle, number: int, path: Path, rows: dict[str, TableRow]
-) -> Comparison:
+) -> list[Comparison]:
+    """One for each baseline of an entry."""
     where = place_of(entry, f"{table.name}, row {number}", path)
     values = plain(entry, where)
     if "as" in values:  # a keyword in Python
         values["operation"] = values.pop("as")
+    if isinstance(values.get("baseline"), str):
+        values["baseline"] = [values["baseline"]]
     read = build(_ComparisonEntry, values, where)
     require(read.operation in OPERATIONS, f"{where}: as", " or ".join(OPERATIONS), read.operation)
     require(read.of in COMPARED, f"{where}: of", " or ".join(COMPARED), read.of)
@@ -75,14 +79,17 @@ def _comparison(
     if table.printed is not None or read.paper is not None:
         labels = {} if table.printed is None else {c.label: c for c in paper_comparisons(table.printed)}
         paper = named(read.paper, labels, f"{where}: unknown row of the paper's Table {table.printed}")
-    return Comparison(
-        table=table.name,
-        row=_row(read.row, rows, where),
-        baseline=_row(read.baseline, rows, where),
-        of=read.of,
-        operation=read.operation,
-        paper=paper,
-    )
+    return [
+        Comparison(
+            table=table.name,
+            row=_row(read.row, rows, where),
+            baseline=_row(baseline, rows, where),
+            of=read.of,
+            operation=read.operation,
+            paper=paper,
+        )
+        for baseline in read.baseline
+    ]
 
 
 def _row(name: str, rows: dict[str, TableRow], where: str) -> TableRow:

@@ -82,3 +82,23 @@ def test_a_row_may_want_another_evaluation(tmp_path: Path):
     path.write_text(TEXT.replace("nfe: 2 }", "nfe: 2, evaluation: { episodes: 50 } }", 1))
     row = read_mapping(path).rows[3]
     assert (row.wanted.episodes, row.wanted.first_seed) == (50, 100_000)
+
+
+def with_baselines(path: Path, baselines: str) -> Path:
+    """A copy of the tables in which all comparisons on `transfer_dwell` are of one row with these."""
+    head, title, rest = TEXT.partition("\ndwell_compared:\n")
+    entry = f"  - {{ row: dwell_imf_infer1, baseline: {baselines}, of: success_episodes, as: difference }}"
+    path.write_text(head + title + entry + rest[rest.index("\n\n") :])
+    return path
+
+
+def test_a_list_of_baselines_is_as_many_comparisons(tmp_path: Path):
+    mapping = read_mapping(with_baselines(tmp_path / "two.yaml", "[dwell_imle, dwell_l1]"))
+    found = [(c.row.name, c.baseline.name) for c in mapping.of_comparisons("dwell_compared")]
+    assert found == [("dwell_imf_infer1", "dwell_imle"), ("dwell_imf_infer1", "dwell_l1")]
+
+
+@pytest.mark.parametrize("baselines", ["[]", "[dwell_l1, dwell_l1]", "{}"])
+def test_baselines_are_a_name_or_different_names(tmp_path: Path, baselines):
+    with pytest.raises(UserError, match=r"dwell_compared, row 1\.baseline must be"):
+        read_mapping(with_baselines(tmp_path / "tables.yaml", baselines))
