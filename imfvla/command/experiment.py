@@ -33,6 +33,7 @@ from imfvla.storage.run_directory import DONE, EXECUTION_KEYS, FAILED, RUNNING, 
 from imfvla.training.checkpoint import check_weights
 from imfvla.training.data import check_episodes, make_loader, prepare_windows, refuse_other_source
 from imfvla.training.experiment import ExperimentOptions
+from imfvla.training.far_targets import far_targets
 from imfvla.training.loop import Trainer
 from imfvla.training.parallel import Alone, joined_processes
 
@@ -174,6 +175,8 @@ def _train(
     initial = np.random.SeedSequence([options.seed, INITIALISATION_STREAM]).generate_state(1, np.uint64)
     torch.manual_seed(int(initial[0]))
     policy = build_policy(config, windows.statistics())
+    if processes.is_first and (far := far_targets(windows, policy.chunks)):
+        log.warning(far)
     if not run.last_state.exists():  # a state has the weights, and their file may be gone
         initialise_from_pretrained(policy)
     num_parameters = sum(parameter.numel() for parameter in policy.parameters())
