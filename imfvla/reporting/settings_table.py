@@ -64,11 +64,11 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     rows += [(text, *map(_cell, line)) for text, line in zip(settings, lines, strict=True)]
     keys = [tuple(usual), *(tuple(one.result.name if one else "" for one in line) for line in lines)]
     measured = [one for one in found if one.success]
-    tests = ", ".join(dict.fromkeys(one.success.test for one in measured)) or "none yet"
+    tests = ", ".join(dict.fromkeys(one.success.test for one in measured))
+    star = f"A star: p below {ALPHA} ({tests}; Holm over {len(measured)} comparisons). " if measured else ""
     notes = [
         "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from "
-        f"the same starts; last the average return. A star: p below {ALPHA} ({tests}; Holm over "
-        f"{len(measured)} comparisons). A dash: the setting is in no line for this row.",
+        f"the same starts; last the average return. {star}A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
         *(
             _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
