@@ -54,7 +54,8 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
 def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     """Settings in lines and methods in columns for people; a line for each number for programs."""
     found = against_unchanged(table, results)
-    told = {one.usual.name: one.usual for one in found}
+    widest = sorted((one.usual for one in found), key=lambda result: len(result.evaluated))
+    told = {result.name: result for result in widest}
     usual = {name: told[name] for name in table.rows if name in told}
     names, shared = short_labels([result.row for result in usual.values()])
     settings = list(dict.fromkeys(world(one.result.row.changes) for one in found))
@@ -70,6 +71,9 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
         "Successes of so many episodes; in parentheses the difference from the first line in percentage points, from "
         f"the same starts; last the average return. {star}A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
+        "Settings with fewer episodes than the first line are compared with the same training seeds there."
+        if any(len(one.usual.evaluated) < len(told[one.usual.name].evaluated) for one in measured)
+        else "",
         *(
             _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
             for name in (usual if len(settings) > 1 else ())  # one setting says itself

@@ -216,6 +216,19 @@ def test_only_training_seeds_that_were_played_in_a_setting_are_compared(tmp_path
     assert delayed[1].startswith(f"{count}/100 (+0)")
 
 
+def test_the_first_line_has_every_training_seed_of_any_setting(tmp_path):
+    for seed in (0, 1):
+        answer_row(tmp_path, BY_NAME[BASES[0]], seed=seed)
+        answer_row(tmp_path, BY_NAME[BASES[0]], seed=seed, **RUNNING)
+    answer_row(tmp_path, BY_NAME[BASES[0]], **RUNNING | {"meanwhile": "hold"})
+    sources = Sources([tmp_path])
+    both = rows({"clock": "running", "delay_ms": 120, "meanwhile": ["continue", "hold"], "rows": [BASES[0]]})
+    found = [Result.of(sources.answer(row, MAPPING)) for row in (*(BY_NAME[name] for name in BASES), *both)]
+    shown = settings_table(TABLE, found).shown
+    assert ["/200" in line[1] for line in shown.rows] == [True, True, False]
+    assert any(note.startswith("Settings with fewer episodes") for note in shown.notes)
+
+
 def test_events_that_always_came_are_one_sentence(tmp_path):
     told = Result.of(answered_bump(tmp_path, [True] * 100))
     document = settings_table(TABLE, [*(Result.of(answer) for answer in unchanged(tmp_path)), told])
