@@ -62,10 +62,5 @@ def _has_evaluations(config: Mapping[str, Any], directory: Path, step: int) -> b
         }
         return offline is not None and kept.items() <= offline["protocol"].items()
     asked = build(EvaluationOptions, wanted, "evaluation").in_protocol()
-    protocol = asked | {"checkpoint_step": step}
-    of_protocol = [
-        evaluation
-        for evaluation in evaluations(run, found)
-        if protocol.items() <= evaluation.summary["protocol"].items()
-    ]
-    return {*wanted["nfe"]} <= {evaluation.nfe for evaluation in of_protocol}
+    done = evaluations(run, found, asked | {"checkpoint_step": step})
+    return {*wanted["nfe"]} <= {evaluation.nfe for evaluation in done}

@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,16 +110,20 @@ def key_of(run: Path, experiment: str) -> str:
     return "" if name == experiment else run_key(name)
 
 
-def evaluations(run: RunDirectory, config: dict[str, Any] | None = None) -> list[Evaluation]:
+def evaluations(
+    run: RunDirectory, config: dict[str, Any] | None = None, protocol: Mapping[str, Any] | None = None
+) -> list[Evaluation]:
     """All finished evaluations of a run, by folder name; one that is being replaced counts as unfinished.
 
     Raises UserError for broken summaries and episodes, and where config.yaml is not what was trained and evaluated.
 
-    Pass `config` to avoid reading it again.
+    Args:
+      config: the run's, to avoid reading it again.
+      protocol: what the protocol of an evaluation must say; the episodes of others are not read.
     """
     config = run.config() if config is None else config
     folders = sorted(path.parent for path in run.path.glob("rollouts/*/summary.json"))
-    found = (_read_whole(run, folder, config) for folder in folders)
+    found = (_read_whole(run, folder, config, protocol or {}) for folder in folders)
     return [evaluation for evaluation in found if evaluation is not None]
 
 
@@ -160,11 +164,13 @@ def _rank(evaluation: Evaluation) -> tuple[bool, bool, int, int]:
     return evaluation.is_reporting, evaluation.is_usual, summary["checkpoint_step"], summary["episodes"]
 
 
-def _read_whole(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation | None:
-    """An evaluation as one command wrote it, None while another one replaces it."""
+def _read_whole(
+    run: RunDirectory, folder: Path, config: dict[str, Any], protocol: Mapping[str, Any]
+) -> Evaluation | None:
+    """An evaluation as one command wrote it, None while another one replaces it, or where its protocol differs."""
     while (before := _version(folder)) is not None:
         try:
-            return _read(run, folder, config)
+            return _read(run, folder, config, protocol)
         except UserError:
             if _version(folder) == before:
                 raise
@@ -180,9 +186,13 @@ def _version(folder: Path) -> tuple[int, int] | None:
     return found.st_ino, found.st_mtime_ns
 
 
-def _read(run: RunDirectory, folder: Path, config: dict[str, Any]) -> Evaluation:
+def _read(
+    run: RunDirectory, folder: Path, config: dict[str, Any], protocol: Mapping[str, Any]
+) -> Evaluation | None:
     path = folder / "summary.json"
     summary = read_summary(path, run.path)
+    if not protocol.items() <= summary["protocol"].items():
+        return None
     refuse_changed_config(run, config, summary["checkpoint_step"])
     refuse_other_config(config, run.path, path, summary.get(DIGEST))
     summary, episodes = recomputed(folder, summary, home=run.path)
