@@ -145,7 +145,9 @@ def _is_measured(table: TableTitle, mapping: RowMapping, results: Sequence[Resul
         compared = mapping.of_comparisons(table.name)
         return any({one.row.name, one.baseline.name} <= found.keys() for one in compared)
     if table.of == METHODS:
-        return any(row.name in found for entry in mapping.of_methods(table.name) for row in entry.rows)
+        return any(
+            row.name in found for entry in mapping.of_methods(table.name) for row in entry.rows.values()
+        )
     return any(result.row.table == table.name for result in found.values())
 
 

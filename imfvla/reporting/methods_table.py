@@ -24,12 +24,10 @@ def methods_table(
 ) -> Document:
     """Methods in lines, and the tables `of` their rows in columns. `results` are of all rows."""
     named = {result.name: result for result in results}
-    places = [
-        place for place in of if any(row.table == place.name for entry in methods for row in entry.rows)
-    ]
+    places = [place for place in of if any(place.name in entry.rows for entry in methods)]
     rows, data, keys, commands = [], [], [], {}
     for entry in methods:
-        found = {row.table: named[row.name] for row in entry.rows}
+        found = {place: named[row.name] for place, row in entry.rows.items()}
         measured = [result for result in found.values() if not result.is_missing]
         ms = median(_chunk_times(measured)) if measured else None
         minutes = training_minutes({one.evaluation.run for result in measured for one in result.evaluated})

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from imfvla.reporting.mapping.settings import label, name_of, short_labels, world
+from imfvla.reporting.mapping.settings import label, short_labels, world
 from imfvla.reporting.mapping.tables import TableTitle
 from imfvla.reporting.metrics import condition_happened
 from imfvla.reporting.results import Result
@@ -44,9 +44,7 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
     found = []
     for result in results:
         if result.row.table == table.name:
-            changes = result.row.changes
-            base = next(name for name in table.rows if result.name == name_of(table.name, name, changes))
-            found.append(_compared(result, _of_the_same_seeds(named[base], result)))
+            found.append(_compared(result, _of_the_same_seeds(named[result.row.base], result)))
     corrected = holm([one.success.p if one.success else None for one in found])
     return [replace(one, p_holm=p) for one, p in zip(found, corrected, strict=True)]
 

@@ -35,8 +35,8 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
     trained(answer_row(tmp_path, BY_NAME[NAMES[1]], latency_ms=6.0), 180.0)
     sources = Sources([tmp_path])
     results = [Result.of(sources.answer(BY_NAME[name], MAPPING)) for name in NAMES]
-    entries = [MethodEntry("needs", "iMF", tuple(BY_NAME[name] for name in NAMES[:2]))]
-    entries += [MethodEntry("needs", "L1", (BY_NAME[NAMES[2]],))]
+    imf, l1 = ({BY_NAME[name].table: BY_NAME[name] for name in names} for names in (NAMES[:2], NAMES[2:3]))
+    entries = [MethodEntry("needs", "iMF", imf), MethodEntry("needs", "L1", l1)]
     document = methods_table(MAPPING.table("needs"), entries, MAPPING.of_rows, results)
     assert document.shown.columns == (
         "Method", "Object transfer", "A hand-over whose moment is hidden", "Chunk ms", "Training min"
@@ -57,13 +57,26 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
     assert float(lines[0]["success_share"]) == pytest.approx(share / 100)
 
 
+def test_a_row_in_a_setting_stands_in_the_column_of_its_table(tmp_path):
+    (line,) = (
+        line for line in MAPPING.of_methods("needs") if line.method == "iMF-AttnRes, 1 evaluation, zero noise"
+    )
+    answer_row(tmp_path, BY_NAME["transfer_imf_infer1"], quality=0.2)
+    answer_row(tmp_path, BY_NAME["transfer_imf_infer1"], quality=0.9, noise="zero")
+    sources = Sources([tmp_path])
+    results = [Result.of(sources.answer(row, MAPPING)) for row in line.rows.values()]
+    document = methods_table(MAPPING.table("needs"), [line], MAPPING.of_rows, results)
+    transfer = document.shown.columns.index("Object transfer")
+    assert float(document.shown.rows[0][transfer].split()[0]) > 60
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
             "rows: [socket800_l1, transfer_l1, dwell_l3]",
-            r"needs, row 10: unknown row 'dwell_l3'",
+            r"needs, row 18: unknown row 'dwell_l3'",
         ),
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
@@ -72,10 +85,15 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
         ),
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
-            "rows: []",
-            r"row 10: rows must be one row of each table at most",
+            'rows: [transfer_imf_infer1, "transfer_zero: transfer_imf_infer1, zero noise"]',
+            r"rows must be one row of each table",
         ),
-        ('method: "L1 regression", rows', "rows", r"needs, row 10\.method: give it a value"),
+        (
+            "rows: [socket800_l1, transfer_l1, dwell_l1]",
+            "rows: []",
+            r"row 18: rows must be one row of each table at most",
+        ),
+        ('method: "L1 regression", rows', "rows", r"needs, row 18\.method: give it a value"),
     ],
 )
 def test_a_wrong_line_is_named(tmp_path, old, new, message):

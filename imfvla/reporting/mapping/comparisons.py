@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from imfvla.options import DIFFERENT, build, require, within_length
 from imfvla.reporting.mapping.file import entries, named, place_of, plain
-from imfvla.reporting.mapping.row import TableRow
+from imfvla.reporting.mapping.row import TableRow, row_named
 from imfvla.reporting.mapping.tables import COMPARISONS, TableTitle, check_each_once
 from imfvla.reporting.paper import PaperComparison, paper_comparisons
 
@@ -82,18 +82,11 @@ def _comparisons(
     return [
         Comparison(
             table=table.name,
-            row=_row(read.row, rows, where),
-            baseline=_row(baseline, rows, where),
+            row=row_named(read.row, rows, where),
+            baseline=row_named(baseline, rows, where),
             of=read.of,
             operation=read.operation,
             paper=paper,
         )
         for baseline in read.baseline
     ]
-
-
-def _row(name: str, rows: dict[str, TableRow], where: str) -> TableRow:
-    if name in rows:
-        return rows[name]
-    usual = {other: row for other, row in rows.items() if not row.changes}  # the message names these alone
-    return named(name, usual, f"{where}: unknown row")

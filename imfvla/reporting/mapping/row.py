@@ -1,9 +1,11 @@
 """A row of the tables: the policy, its weights and the evaluation that answer it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from imfvla.reporting.mapping.file import named
 from imfvla.reporting.paper import PaperRow
 from imfvla.storage.run_directory import step_of
 from imfvla.storage.run_names import run_key, run_name
@@ -34,9 +36,9 @@ class TableRow:
     setting: str
     paper: PaperRow | None
     where: str  # file and line, for messages
-    changes: tuple[
-        tuple[str, Any], ...
-    ] = ()  # keys and values of the protocol that differ from `protocol.USUAL`
+    # Of a row in a setting: keys and values of the protocol that differ from `protocol.USUAL`, and the unchanged row.
+    changes: tuple[tuple[str, Any], ...] = ()
+    base: str | None = None
 
     @property
     def run(self) -> str:
@@ -55,6 +57,14 @@ class TableRow:
     def step(self, steps: int) -> int:
         """The step of the row's weights in a training of so many steps."""
         return step_of(steps, self.checkpoint)
+
+
+def row_named(name: str, rows: Mapping[str, TableRow], where: str) -> TableRow:
+    """The row of any table that is called `name`. Raises UserError with those that are in no setting."""
+    if name in rows:
+        return rows[name]
+    usual = {other: row for other, row in rows.items() if not row.changes}
+    return named(name, usual, f"{where}: unknown row")
 
 
 @lru_cache(maxsize=4096)

@@ -42,6 +42,7 @@ def rows_of_settings(
                     name=name_of(table, base.name, changes),
                     table=table,
                     changes=changes,
+                    base=base.name,
                     paper=None,
                     where=where,
                 )
