@@ -1,7 +1,8 @@
 """Gradient clipping by the gradients' own scale, one rule for every method.
 
 A fixed norm means something else for every loss: at 1.0 iMF was clipped in every interval of its metrics, DDPM and L1
-in none (docs/first_campaign.md, "What clipping did"). To AdamW the size of a loss does not matter; so it should not here.
+in none (docs/first_campaign.md, "What clipping did"). To AdamW the size of a loss does not matter; so it should not
+here.
 """
 
 import math

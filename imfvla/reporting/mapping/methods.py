@@ -13,11 +13,11 @@ from imfvla.reporting.mapping.tables import METHODS, TableTitle
 
 @dataclass(frozen=True, slots=True)
 class MethodEntry:
-    """A line of a table of methods: what it is called, and by a table of rows its row there, or one of these in a setting."""
+    """A line of a table of methods."""
 
     table: str  # name of its table
     method: str
-    rows: Mapping[str, TableRow]
+    rows: Mapping[str, TableRow]  # by the name of a table of rows, its row there, as it is or in a setting
 
 
 @dataclass(frozen=True, slots=True)
