@@ -30,7 +30,7 @@ from imfvla.reporting.page import Picture, page
 from imfvla.reporting.published import published_rows
 from imfvla.reporting.results import Result
 from imfvla.reporting.runs import find_runs, key_of
-from imfvla.reporting.settings_table import settings_table
+from imfvla.reporting.settings_table import settings_table, unchanged_rows
 from imfvla.reporting.table import Table
 from imfvla.reporting.tables import Document, comparison_table, other_table, row_table
 from imfvla.storage.files import write_together
@@ -176,7 +176,7 @@ def _figures(
 ) -> dict[str, tuple[str, dict[str, bytes]]]:
     """Caption and files of each figure, by name; without those of tables that have no `measured` row."""
     settings = {
-        table: [r for r in results if r.row.table == table.name or r.row.name in table.rows]
+        table: [*unchanged_rows(table, results).values(), *(r for r in results if r.row.table == table.name)]
         for table in mapping.of_settings
     }
     results = [result for result in results if not result.row.changes]

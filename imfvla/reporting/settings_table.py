@@ -44,17 +44,25 @@ def against_unchanged(table: TableTitle, results: Sequence[Result]) -> list[Chan
     found = []
     for result in results:
         if result.row.table == table.name:
-            found.append(_compared(result, _of_the_same_seeds(named[result.row.base], result)))
+            found.append(_compared(result, _of_the_same_seeds(named[result.row.base], [result])))
     corrected = holm([one.success.p if one.success else None for one in found])
     return [replace(one, p_holm=p) for one, p in zip(found, corrected, strict=True)]
+
+
+def unchanged_rows(table: TableTitle, results: Sequence[Result]) -> dict[str, Result]:
+    """The rows of a table of settings in the unchanged world, of every training seed that a setting was played with."""
+    played: dict[str, list[Result]] = {}
+    for result in results:
+        if result.row.table == table.name:
+            played.setdefault(result.row.base, []).append(result)
+    named = {result.name: result for result in results}
+    return {name: _of_the_same_seeds(named[name], played[name]) for name in table.rows if name in played}
 
 
 def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     """Settings in lines and methods in columns for people; a line for each number for programs."""
     found = against_unchanged(table, results)
-    widest = sorted((one.usual for one in found), key=lambda result: len(result.evaluated))
-    told = {result.name: result for result in widest}
-    usual = {name: told[name] for name in table.rows if name in told}
+    usual = unchanged_rows(table, results)
     names, shared = short_labels([result.row for result in usual.values()])
     settings = list(dict.fromkeys(world(one.result.row.changes) for one in found))
     cells = {(world(one.result.row.changes), one.usual.name): one for one in found}
@@ -70,7 +78,7 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
         f"the same starts; last the average return. {star}A dash: the setting is in no line for this row.",
         f"All methods: {shared}." if shared else "",
         "Settings with fewer episodes than the first line are compared with the same training seeds there."
-        if any(len(one.usual.evaluated) < len(told[one.usual.name].evaluated) for one in measured)
+        if any(len(one.usual.evaluated) < len(usual[one.usual.name].evaluated) for one in measured)
         else "",
         *(
             _sentence(names[usual[name].row.label], [one for one in measured if one.usual.name == name])
@@ -89,9 +97,9 @@ def settings_table(table: TableTitle, results: Sequence[Result]) -> Document:
     return Document(shown, Table(table.title, COLUMNS, tuple(data)))
 
 
-def _of_the_same_seeds(usual: Result, result: Result) -> Result:
-    """The unchanged row of the training seeds that were played in the setting: other weights are no pairs of these."""
-    seeds = {found.evaluation.training_seed for found in result.evaluated}
+def _of_the_same_seeds(usual: Result, results: Sequence[Result]) -> Result:
+    """The unchanged row of the training seeds that were played in the settings: other weights are no pairs of these."""
+    seeds = {found.evaluation.training_seed for result in results for found in result.evaluated}
     kept = [found for found in usual.evaluated if found.evaluation.training_seed in seeds]
     return Result(kept, usual.answer) if kept else usual
 
