@@ -39,7 +39,7 @@ def rows_of_settings(
             found += [
                 replace(
                     base,
-                    name=name_of(table, base.name, changes),
+                    name=f"{table}: {base.name}, {label(changes)}",
                     table=table,
                     changes=changes,
                     base=base.name,
@@ -49,11 +49,6 @@ def rows_of_settings(
                 for base in bases
             ]
     return found
-
-
-def name_of(table: str, row: str, changes: Sequence[tuple[str, Any]]) -> str:
-    """Of a row in a setting, unique among all tables."""
-    return f"{table}: {row}, {label(changes)}"
 
 
 def label(changes: Sequence[tuple[str, Any]]) -> str:
