@@ -14,8 +14,8 @@ from imfvla.reporting.tables import Document
 LATENCY, SHARE = BY_NAME["inference_ms_median"], BY_NAME["success_share"]
 NOTES = (
     "Success in percent with its 95% interval, and the number of training seeds where it is not one. Chunk: median "
-    "over all replannings of these rows. Training: mean time of these policies on the machines that trained them, "
-    "often two at a time with a core each.",
+    "over all replannings of these rows. Training: mean time of these policies. Both times are of the machines that "
+    "these rows came from, which often had two of them at a time, a core each.",
 )
 
 
@@ -34,11 +34,13 @@ def methods_table(
         successes = [_success(found.get(place.name)) for place in places]
         rows.append((entry.method, *successes, number(ms, 1), number(minutes, 1)))
         data += [_data(entry, place, found[place.name], minutes) for place in places if place.name in found]
-        keys.append(tuple(result.name for result in found.values()))
+        keys.append((*(found[place.name].name if place.name in found else "" for place in places), "", ""))
         commands |= {r.row.label: r.answer.command for r in found.values() if r.is_missing}
     titles = [place.title.split(": ")[-1] for place in places]
     columns = ("Method", *(title[:1].upper() + title[1:] for title in titles), "Chunk ms", "Training min")
-    shown = Table(table.title, columns, tuple(rows), NOTES, tuple(keys), tuple(commands.items()))
+    shown = Table(
+        table.title, columns, tuple(rows), NOTES, commands=tuple(commands.items()), cell_keys=tuple(keys)
+    )
     return Document(shown, Table(table.title, COLUMNS, tuple(data)))
 
 

@@ -9,6 +9,8 @@ from imfvla.reporting.mapping.comparisons import Comparison
 from imfvla.reporting.mapping.row import TableRow
 from imfvla.reporting.statistics.power import ALPHA, POWER, detectable_share_difference
 
+VERSUS = " vs "  # between the two rows of a comparison, in the paper's words too
+
 
 def detectable_success(pairs: int) -> str:
     """The smallest difference of successes that so many episodes of two policies show."""
@@ -43,7 +45,7 @@ def names(comparison: Comparison) -> tuple[str, str]:
     common = set(_parts(row)) & set(_parts(baseline))
     # what both rows have is not said, but how often they call the network is
     common = {part for part in common if not part.startswith("infer")}
-    return f"{_short(row, common)} vs {_short(baseline, common)}", BY_NAME[comparison.of].title
+    return f"{_short(row, common)}{VERSUS}{_short(baseline, common)}", BY_NAME[comparison.of].title
 
 
 def label(comparison: Comparison) -> str:

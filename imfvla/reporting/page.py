@@ -9,6 +9,7 @@ from imfvla.reporting.answers import Evaluated
 from imfvla.reporting.escaping import html_text
 from imfvla.reporting.mapping.settings import label
 from imfvla.reporting.media import Media
+from imfvla.reporting.notes import VERSUS
 from imfvla.reporting.page_rows import anchor, differences_of, rollouts_of
 from imfvla.reporting.records import Row
 from imfvla.reporting.results import Result
@@ -76,7 +77,8 @@ def _table(table: Table, named: Mapping[str, Result], media: Media) -> str:
         if len(keys) == 1 and keys[0] in named:
             cells[0] = f'<a href="#{_anchor(keys[0])}">{cells[0]}</a>'
         elif len(keys) > 1:
-            cells[0] += "".join(f' <a href="#{_anchor(key)}">{html_text(key)}</a>' for key in keys)
+            row_and_baseline = zip(keys, cells[0].split(VERSUS, 1), strict=False)
+            cells[0] = VERSUS.join(f'<a href="#{_anchor(key)}">{name}</a>' for key, name in row_and_baseline)
         if table.cell_keys:
             linked = zip(cells[1:], table.cell_keys[len(lines)], strict=True)
             cells[1:] = [_linked(cell, named.get(key)) for cell, key in linked]

@@ -49,6 +49,7 @@ def test_a_line_has_success_on_every_task_and_the_means_of_its_policies(tmp_path
     assert 6.0 < float(imf[3]) < 6.7  # the fakes take up to a tenth more
     assert imf[4] == "2.0"
     assert l1 == ("L1", "missing", "-", "-", "-")
+    assert document.shown.cell_keys == ((*NAMES[:2], "", ""), (NAMES[2], "", "", ""))
     assert [name for name, _ in document.shown.commands] == [BY_NAME[NAMES[2]].label]
     lines = list(csv.DictReader(io.StringIO(document.data.csv())))
     assert [(line["row"], line["training_seeds"], line["status"]) for line in lines] == [
