@@ -93,7 +93,7 @@ def test_the_frontier_is_what_nothing_beats_in_both():
 def test_printed_values_and_ours_are_in_panels_of_their_own(results):
     paper, ours = reward_latency(of_table(results, "table1")).axes
     assert len(paper.texts) == 7
-    assert len(ours.texts) == 18
+    assert len(ours.texts) == 15
     assert "3" in [text.get_text() for text in paper.texts]
 
 
