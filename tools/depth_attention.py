@@ -16,9 +16,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from imfvla.errors import UserError
-from imfvla.nn.residual import AttentionResidual
-from imfvla.rollouts.depth_attention import measure_depth_attention
+from imfvla.rollouts.depth_attention import attention_residuals, measure_depth_attention
 from imfvla.rollouts.workbench import load_workbench
 from imfvla.storage.documents import read_json
 from imfvla.storage.files import refuse_existing, write_json
@@ -36,13 +34,8 @@ def write_uniform(run: RunDirectory, step: int, target: RunDirectory) -> Path:
     """
     refuse_existing(target.path, "choose a new folder")
     policy = load_policy(run, step)
-    queries = [m.query for m in policy.core.modules() if isinstance(m, AttentionResidual)]
-    if not queries:
-        raise UserError(
-            f"{run.path} has no Attention Residuals: choose a run of core=attnres or block_attnres."
-        )
-    for query in queries:
-        query.zero_()
+    for residual in attention_residuals(policy.core):
+        residual.query.zero_()
     target.claim(run.config())
     description = read_json(run.policy_weights(step).with_suffix(".json"), "restore it", mapping=True)
     save_weights(target.weights_directory(step), policy, description)

@@ -31,10 +31,11 @@ def methods_table(
         measured = [result for result in found.values() if not result.is_missing]
         ms = median(_chunk_times(measured)) if measured else None
         minutes = training_minutes({one.evaluation.run for result in measured for one in result.evaluated})
-        successes = [_success(found.get(place.name)) for place in places]
-        rows.append((entry.method, *successes, number(ms, 1), number(minutes, 1)))
-        data += [_data(entry, place, found[place.name], minutes) for place in places if place.name in found]
-        keys.append((*(found[place.name].name if place.name in found else "" for place in places), "", ""))
+        cells = [found.get(place.name) for place in places]
+        rows.append((entry.method, *map(_success, cells), number(ms, 1), number(minutes, 1)))
+        filled = [(place, result) for place, result in zip(places, cells, strict=True) if result]
+        data += [_data(entry, place, result, minutes) for place, result in filled]
+        keys.append((*(result.name if result else "" for result in cells), "", ""))
         commands |= {r.row.label: r.answer.command for r in found.values() if r.is_missing}
     titles = [place.title.split(": ")[-1] for place in places]
     columns = ("Method", *(title[:1].upper() + title[1:] for title in titles), "Chunk ms", "Training min")

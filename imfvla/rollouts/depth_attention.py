@@ -44,12 +44,10 @@ class DepthWeights:
         ]
 
 
-@contextmanager
-def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
-    """Inside, every pass through `core` adds its weights to what is yielded; what it computes stays as it is.
+def attention_residuals(core: nn.Module) -> list[AttentionResidual]:
+    """Those of a core: first of its own blocks, then of those for the average velocity, where it has them apart.
 
-    The action tokens are those of the blocks that sample: a core may have others for the instantaneous velocity, which
-    hold the context. Raises UserError where the core has no Attention Residuals.
+    Raises UserError where the core has no Attention Residuals.
     """
     residual = getattr(core, "residual", None)
     if not isinstance(residual, AttentionResidual):
@@ -57,8 +55,18 @@ def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
             f"the core's residual must be Attention Residuals, found {type(residual).__name__}: choose a run "
             "trained with core=attnres or core=block_attnres."
         )
-    recorded = DepthWeights(len(residual.query))
-    residuals = [residual, *([core.average.residual] if getattr(core, "average", None) else [])]
+    return [residual, *([core.average.residual] if getattr(core, "average", None) else [])]
+
+
+@contextmanager
+def record_depth_weights(core: nn.Module) -> Iterator[DepthWeights]:
+    """Inside, every pass through `core` adds its weights to what is yielded; what it computes stays as it is.
+
+    The action tokens are those of the blocks that sample: a core may have others for the instantaneous velocity, which
+    hold the context. Raises UserError where the core has no Attention Residuals.
+    """
+    residuals = attention_residuals(core)
+    recorded = DepthWeights(len(residuals[0].query))
     in_forward = False
 
     def enter(*_: Any) -> None:

@@ -31,7 +31,7 @@ def test_a_policy_with_uniform_weights_differs_in_its_queries_alone(tmp_path, mo
 @pytest.mark.parametrize(
     ("overrides", "target", "message"),
     [
-        (["core=standard"], "new", "has no Attention Residuals"),
+        (["core=standard"], "new", "must be Attention Residuals, found StandardResidual"),
         ([], "run", "exists already: choose a new folder"),
     ],
 )
