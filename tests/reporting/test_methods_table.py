@@ -77,7 +77,7 @@ def test_a_row_in_a_setting_stands_in_the_column_of_its_table(tmp_path):
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
             "rows: [socket800_l1, transfer_l1, dwell_l3]",
-            r"needs, row 19: unknown row 'dwell_l3'",
+            r"needs, row 18: unknown row 'dwell_l3'",
         ),
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
@@ -92,9 +92,9 @@ def test_a_row_in_a_setting_stands_in_the_column_of_its_table(tmp_path):
         (
             "rows: [socket800_l1, transfer_l1, dwell_l1]",
             "rows: []",
-            r"row 19: rows must be one row of each table at most",
+            r"row 18: rows must be one row of each table at most",
         ),
-        ('method: "L1 regression", rows', "rows", r"needs, row 19\.method: give it a value"),
+        ('method: "L1 regression", rows', "rows", r"needs, row 18\.method: give it a value"),
     ],
 )
 def test_a_wrong_line_is_named(tmp_path, old, new, message):

@@ -100,6 +100,12 @@ def test_each_row_of_ours_is_one_link_away_from_its_episodes(reader):
     assert "100 episodes" in text
 
 
+def test_the_names_of_a_comparison_lead_to_its_two_rows(run):
+    compared = Table("Compared", ("Comparison",), (("a < b vs c",),), keys=(("socket_l1", "socket_act"),))
+    text = page([compared], [], [], Media(run, is_copied=False))
+    assert '<a href="#row-socket_l1">a &lt; b</a> vs <a href="#row-socket_act">c</a>' in text
+
+
 def test_a_missing_row_has_its_command(reader):
     text = "".join(reader.texts)
     assert "SmolVLA (100k), nfe 10: missing" in text
